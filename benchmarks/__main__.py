@@ -5,8 +5,6 @@ sessions in one room, conjugate gradients against Ceres' ITERATIVE_SCHUR. tango:
 Tango map. start: the first optvi on a machine and in a process. See docs/benchmarks.md.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json

@@ -3,8 +3,6 @@
 python -m benchmarks.bags [--messages 20000] [--repeats 3]
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import tempfile

@@ -1,7 +1,5 @@
 """Ceres on the visual benchmark problems, through pycolmap's bundle adjuster (C++ cost functions)."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -3,8 +3,6 @@
 Prints one line of JSON: effort of the fastest of several runs, memory of the first, cost.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json

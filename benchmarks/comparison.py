@@ -1,7 +1,5 @@
 """Solvers compared: each in a process of its own, in the same environment, one after the other."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os

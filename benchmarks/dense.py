@@ -5,8 +5,6 @@ python -m benchmarks.dense [--folder FOLDER] [--optimised]
 FOLDER keeps the simulation for the next run. Open3D is compared where it is installed (open3d-cpu).
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import importlib.util

@@ -1,7 +1,5 @@
 """GTSAM's Levenberg-Marquardt on the visual-inertial benchmark problems."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

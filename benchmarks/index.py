@@ -3,8 +3,6 @@
 python -m benchmarks.index [--cells 32 24 16 12] [--descriptors 100000]
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import time

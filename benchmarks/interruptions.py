@@ -1,7 +1,5 @@
 """Ctrl-C in every command on the Tango map: `python -m benchmarks.interruptions [COMMAND...]`."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile

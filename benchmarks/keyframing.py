@@ -3,8 +3,6 @@
 python -m benchmarks.keyframing
 """
 
-from __future__ import annotations
-
 import time
 
 from maplab_py.algorithms.keyframing.heuristic import keyframe

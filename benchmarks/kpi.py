@@ -6,8 +6,6 @@ machines and days compare. `--write` stores them as `docs/kpi/VERSION.json` and 
 worse than those before it.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json

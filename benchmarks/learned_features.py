@@ -6,8 +6,6 @@ the pose that most agree on is judged by ground truth. A pair counts as verified
 keypoints agree as no wrong pose has in any pair of the run, and never fewer than `lc` wants.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json

@@ -4,8 +4,6 @@ The map is made by day. One session of queries crosses the room in a quarter of 
 the walls in an eighth of it, with gains that jump and more surfaces that are repainted.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 from pathlib import Path

@@ -7,8 +7,6 @@ the folder and live. `hours` plays a rendered flight forward and backward for so
 follows, and looks at the memory.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import re

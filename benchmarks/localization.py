@@ -3,8 +3,6 @@
 python -m benchmarks.localization
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import time

@@ -7,8 +7,6 @@ Keyframes are 0.75 m apart and look outwards at a wall; every landmark has been 
 sessions and laps. With inertial samples, so that each keyframe has 15 states.
 """
 
-from __future__ import annotations
-
 import argparse
 
 import numpy as np

@@ -6,8 +6,6 @@ Every mission walks about the same room for some seconds. The exponent is the sl
 of processor time between the smallest and the largest number of missions.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import sys
 import time

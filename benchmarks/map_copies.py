@@ -5,8 +5,6 @@
 Copies come under new ids; poses are disturbed by 1 cm and 2 mrad, base frames by 5 cm and 5 mrad of yaw.
 """
 
-from __future__ import annotations
-
 import argparse
 
 import numpy as np

@@ -4,8 +4,6 @@ python -m benchmarks.map_quality workflow [SEED ...] [--keyframed] [--scenario N
 python -m benchmarks.map_quality thinning [SEED ...] [--keyframed] [--scenario NAME]
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import time

@@ -1,7 +1,5 @@
 """This project's optimiser on the benchmark problems."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from benchmarks.problems import (

@@ -3,8 +3,6 @@
 `python -m benchmarks.optvi FOLDER [REPEATS]` measures in its own process and prints JSON.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import tempfile

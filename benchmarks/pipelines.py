@@ -4,8 +4,6 @@ FOLDER has the maps. Beside the run times the utilisation is printed: the part o
 which tasks ran. On a machine that does other work the run times say little, the utilisation still does.
 """
 
-from __future__ import annotations
-
 import sys
 import tempfile
 import time

@@ -11,8 +11,6 @@ does filling GTSAM's graph; this project's time includes all from the arrays of 
 column is the time with the default robustness over that of the plain least squares.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json

@@ -8,8 +8,6 @@ two poses are known, which fixes the gauge of the visual problem.
 The inertial samples belong to a rotation and position spline through the true poses.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -3,8 +3,6 @@
 python -m benchmarks.rendering [--scenario stereo_room] [--images 20]
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import os

@@ -8,8 +8,6 @@ calibrates with every candidate; it is measured for sessions up to --gain_up_to,
 minutes.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json

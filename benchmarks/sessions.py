@@ -4,8 +4,6 @@ Who sees what is that of the simulated scenario `one_room_many_sessions`, every 
 world's points are. Pixels, camera and disturbed initial values are those of the other problems.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import multiprocessing
 

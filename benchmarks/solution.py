@@ -1,7 +1,5 @@
 """What a solver returns of a benchmark problem, and what it cost."""
 
-from __future__ import annotations
-
 import dataclasses
 import resource
 import time

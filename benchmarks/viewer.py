@@ -3,8 +3,6 @@
 python -m benchmarks.viewer
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

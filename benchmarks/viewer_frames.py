@@ -6,8 +6,6 @@ Frames are drawn one after the other, each waited for, on one page of 1000 x 700
 are processor time of the browser, which depends little on what else the machine does.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

@@ -1,7 +1,5 @@
 """Entry of the program `maplab`, also as `python -m maplab_py`."""
 
-from __future__ import annotations
-
 import sys
 
 

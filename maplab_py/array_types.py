@@ -1,7 +1,5 @@
 """Names of the types of arrays, one for the whole project."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -7,8 +7,6 @@ lasting effects happen inside `lasting_effect()`: an abandoned or cancelled comm
 and a command inside it cannot be abandoned. Such a block is short: files are prepared beforehand.
 """
 
-from __future__ import annotations
-
 import contextlib
 import threading
 from collections.abc import Callable, Iterator

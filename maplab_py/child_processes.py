@@ -4,8 +4,6 @@ A `Service` is a child that answers requests; both sides are pickled, and arrays
 `in_order` works in threads of this process.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pickle

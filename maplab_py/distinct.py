@@ -1,7 +1,5 @@
 """Distinct values of large arrays."""
 
-from __future__ import annotations
-
 from typing import TypeVar
 
 import numpy as np

@@ -4,8 +4,6 @@ Linux overcommits memory and kills the process when it runs out. Therefore large
 announced by `require_memory` beforehand.
 """
 
-from __future__ import annotations
-
 import contextlib
 import re
 from collections.abc import Iterator

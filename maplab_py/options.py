@@ -8,8 +8,6 @@ named `flag_prefix` + field. The string after a field is its help, the end of it
         \"""Side of a voxel\"""
 """
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 import functools

@@ -5,8 +5,6 @@ are recorded instead. --dry_run uses this. Inside `staging()` files are written 
 names and published together: a command that fails or is cancelled leaves no files.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import stat
 from collections.abc import Iterable, Iterator

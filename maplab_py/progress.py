@@ -1,7 +1,5 @@
 """Progress of long computations, and their cancellation."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 

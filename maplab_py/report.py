@@ -1,7 +1,5 @@
 """Reports: results of an algorithm as small dataclasses of numbers that a user would ask for."""
 
-from __future__ import annotations
-
 import dataclasses
 import html
 import json

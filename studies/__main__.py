@@ -13,8 +13,6 @@ differ. `page` writes self_calibration_results.md and images/ into a folder; `pi
 coloured by information.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import sys

@@ -1,7 +1,5 @@
 """Errors of the calibrations of simulated sessions for several selections of segments."""
 
-from __future__ import annotations
-
 import dataclasses
 import sys
 import time

@@ -1,7 +1,5 @@
 """Simulated sessions of one device with known truth, and files of results."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

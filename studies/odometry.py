@@ -4,8 +4,6 @@ Schneider 2019 evaluates a calibration by the error of odometry that uses it. He
 runs over the evaluation session with a fixed calibration: a window of 20 poses, no loop closures.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import sys
 from pathlib import Path

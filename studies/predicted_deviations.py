@@ -4,8 +4,6 @@ Nothing is estimated. Selections that score each segment alone are compared with
 segments greedily to minimise the joint covariance.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

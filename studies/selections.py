@@ -1,7 +1,5 @@
 """Selections of segments that the studies compare."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Services: processes that answer requests, and end with the one that asks."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Files from outside are bounded before anything is allocated; output is complete or not there."""
 
-from __future__ import annotations
-
 import gzip
 import io
 import json

@@ -1,7 +1,5 @@
 """Work that does not fit into memory is refused before it begins."""
 
-from __future__ import annotations
-
 import resource
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Option groups: default, help, unit and range stand once; values out of range name their flag."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import pytest

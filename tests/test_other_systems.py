@@ -1,7 +1,5 @@
 """Maps are optimised and saved where parts of Linux are missing: those of macOS, then those of Windows."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -7,8 +7,6 @@ all together (stage `city`), and prints for each step time, largest memory of a 
 anchored, ATE, closures and merges with those that are wrong.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import resource

@@ -4,8 +4,6 @@ Runs the commands of the stage `city` of flags/city.yaml and prints a line of JS
 largest memory of the process meanwhile, and what it left in the map, against the truth.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import sys

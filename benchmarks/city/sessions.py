@@ -4,8 +4,6 @@ The city grows with the number of sessions, so that each street is walked by as 
 the map of Zurich's old town (Schneider 2019, paper II, 4.4). Walks go round two to six blocks.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor

@@ -5,8 +5,6 @@ all cameras and with the first alone), or maps (replayed, and compared with `opt
 Without folders: the shared data.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json

@@ -5,8 +5,6 @@ on average when the covariances are right, larger when they promise too much. Th
 the deviations it states.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json

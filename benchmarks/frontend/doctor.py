@@ -4,8 +4,6 @@
 faults that are named first, and sound recordings in which something is called wrong.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json

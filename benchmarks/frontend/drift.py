@@ -5,8 +5,6 @@ the first camera, at the true pose, meets the rendered surface in a point; its d
 first keypoint of the track is given in pixels, by the age of the track in images.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from pathlib import Path

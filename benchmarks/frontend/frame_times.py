@@ -6,8 +6,6 @@ are the most expensive. Processor time does not depend on what else the machine 
 has elapsed times.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json

@@ -7,8 +7,6 @@ recorded. Of the odometry and of `optvi` on the same measurements: position erro
 the scale. Outliers, calibration and the model of the IMU are perfect, so that what is left is the estimator.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json

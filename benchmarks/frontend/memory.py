@@ -7,8 +7,6 @@ the device is slowest, so that the step of the velocity there is small. Resident
 that after the first minute.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import itertools

@@ -8,8 +8,6 @@ alignment, the drift over the rest, from its first to its last second, and the l
 two of its positions.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json

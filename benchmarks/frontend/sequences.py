@@ -1,7 +1,5 @@
 """Odometry on whole recordings: error and time of each."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from pathlib import Path

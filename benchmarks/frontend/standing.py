@@ -6,8 +6,6 @@ that it rests. Of the states as they were known at their time: the drift from th
 second of the stop, the largest distance between two positions of it, and how often the odometry started.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json

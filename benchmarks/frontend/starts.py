@@ -8,8 +8,6 @@ truth), and of its last velocity, that is the component along the true one as a 
 below 0.3 m/s has no scale; its error counts as a share of 0.3 m/s. A start at rest has neither.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json

@@ -8,8 +8,6 @@ wrong: the run has to say why, in a note that it does not give with the true cal
 does not start.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json

@@ -8,8 +8,6 @@ project what does the same, to optimise and to marginalise, and all of `add`, wh
 observations, triangulates, looks for outliers, decides on keyframes, and computes a covariance.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json

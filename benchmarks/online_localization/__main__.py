@@ -7,8 +7,6 @@ another one, images end to end; `timings` rebuilds table 4.2. Without map tracki
 thesis'.
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import json

@@ -4,8 +4,6 @@ The submaps have keyframes of 1 Hz with real descriptors, of one flight. A query
 state, in a mission frame that is moved and turned at random.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from pathlib import Path

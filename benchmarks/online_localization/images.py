@@ -8,8 +8,6 @@ the truth by SE(3), with the map, not aligned, and as a batch: its own map after
 optimisation, aligned by SE(3).
 """
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

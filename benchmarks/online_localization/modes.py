@@ -1,7 +1,5 @@
 """All modes of localisation over the same frames, tracks and matches, from one run of the front-end."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 

@@ -3,8 +3,6 @@
 python -m benchmarks.online_localization.picture [SEED [SHARE]]
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Table 4.1 of the thesis on simulated features: six flights make the map, a vehicle is localised in it."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 

@@ -6,8 +6,6 @@ query has the recorded tracks and starts at the optimised state, in a mission fr
 and turned at random.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -6,8 +6,6 @@ it (VIL), and the alignment over the window's matches (SWL). All match alike, so
 matching, RANSAC and VIL, or matching, RANSAC, ODO and SWL.
 """
 
-from __future__ import annotations
-
 import time
 from unittest import mock
 

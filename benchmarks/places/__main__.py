@@ -3,8 +3,6 @@
 python -m benchmarks.places WHAT [SEED ...] [--json FILE]
 """
 
-from __future__ import annotations
-
 import argparse
 import dataclasses
 import itertools

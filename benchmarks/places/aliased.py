@@ -4,8 +4,6 @@ Every seed makes a world and three sessions (scenario aliased_rooms), anchors th
 mission that changes with the seed, relaxes, closes loops and optimises.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -4,8 +4,6 @@ Sessions that visit both are to be anchored, and landmarks of the two rooms must
 session that visits one room nothing tells which it is: it is to stay where it is.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """How clearly pairs of missions tell one alignment: rooms that look alike against real relations."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """The EuRoC submaps against ground truth and an exhaustive search."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 

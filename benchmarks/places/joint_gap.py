@@ -5,8 +5,6 @@ bundle best onto points of the earlier end is the identity where the loop is clo
 the bundle's middle by is the gap. A robust loss takes care of wrong matches.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

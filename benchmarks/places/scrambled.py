@@ -1,7 +1,5 @@
 """The eight EuRoC submaps as missions in scrambled base frames, put together again."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 

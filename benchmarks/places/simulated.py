@@ -1,7 +1,5 @@
 """Four simulated sessions with noisy descriptors: precision and recall of closures, and time."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections.abc import Iterator

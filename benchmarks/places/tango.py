@@ -1,7 +1,5 @@
 """The handheld walk, whose beginning and end are one place: found pairs, and what gap is left."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 from typing import Any

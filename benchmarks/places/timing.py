@@ -1,7 +1,5 @@
 """Processor times beside the speed of the machine."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections.abc import Callable

@@ -5,8 +5,6 @@ and as two. kills: four robots, forty submaps, a server that is killed twenty ti
 time of a submap by stage; `--maps FOLDER` takes maps of robots instead of simulated ones.
 """
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

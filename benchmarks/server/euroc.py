@@ -1,7 +1,5 @@
 """EuRoC V1_01 as eight submaps of one robot, and as two robots with four each."""
 
-from __future__ import annotations
-
 import dataclasses
 
 from benchmarks.server.prepared import prepared

@@ -6,8 +6,6 @@ them. Joint optimisations are left out. Measured is what the server's loop does 
 anchor, close loops, optimise, and publish the map.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import tempfile
 import time

@@ -6,8 +6,6 @@ compared with that of the same submaps joined offline: load_merge_all_submaps of
 optvi, anchors, lc, optvi.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os

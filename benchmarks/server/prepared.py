@@ -1,7 +1,5 @@
 """What a worker makes of a submap, in this process."""
 
-from __future__ import annotations
-
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
 from maplab_py.algorithms.landmarks.quality import evaluate_quality
 from maplab_py.algorithms.vi_optimization.optimization import optimize

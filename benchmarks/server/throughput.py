@@ -5,8 +5,6 @@ two robots are pushed by turns, each when the one before is published. They are 
 `rovioli`, or of two simulated sessions of 60 s in one room at ten keyframes a second.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import resource

@@ -6,8 +6,6 @@ Distances are in bits of 384. "same" are pairs of observations of one landmark, 
 observations of two landmarks. The overlap of two histograms is the area that they share, in percent.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

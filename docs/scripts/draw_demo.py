@@ -3,8 +3,6 @@
 python docs/scripts/draw_demo.py
 """
 
-from __future__ import annotations
-
 import tempfile
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 python docs/scripts/draw_first_map.py
 """
 
-from __future__ import annotations
-
 import sys
 import tempfile
 from pathlib import Path

@@ -3,8 +3,6 @@
 python docs/scripts/draw_pipeline.py
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re

@@ -5,8 +5,6 @@ python docs/scripts/draw_recorded_map.py EUROC_FOLDER
 The folder has ground truth in state_groundtruth_estimate0, which is drawn in grey.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

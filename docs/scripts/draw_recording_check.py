@@ -3,8 +3,6 @@
 MAPLAB_SHARED_DATA=DATA python docs/scripts/draw_recording_check.py
 """
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 python docs/scripts/draw_server.py
 """
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 python docs/scripts/generate_api_page.py
 """
 
-from __future__ import annotations
-
 import dataclasses
 import importlib
 import inspect

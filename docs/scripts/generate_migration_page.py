@@ -6,8 +6,6 @@ Both pages are checked against the registry: a command or a flag of maplab that 
 explained in a table (commands: beside this file, flags: in the package, which tells users) is an error.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from maplab_py.console.commands.flags import COMMON_FLAGS, TABLE, Fate, former_flags

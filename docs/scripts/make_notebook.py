@@ -3,8 +3,6 @@
 python docs/scripts/make_notebook.py    (writes docs/notebooks/multi_session.ipynb)
 """
 
-from __future__ import annotations
-
 import json
 import os
 import tempfile

@@ -1,7 +1,5 @@
 """The table, the findings and the figure of docs/map_maintenance.md, from what was measured."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -6,8 +6,6 @@ Lines of code are those without blank lines, comments and docstrings. With `--si
 that a single other file imports are listed with the size that both would have together.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import io

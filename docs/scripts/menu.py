@@ -1,7 +1,5 @@
 """Hooks of mkdocs: folders in the menu stand for their pages, and links to sources are for the repository."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

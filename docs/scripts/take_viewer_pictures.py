@@ -3,8 +3,6 @@
 python docs/scripts/take_viewer_pictures.py /path/to/tango_handheld [/path/to/keep/demo]
 """
 
-from __future__ import annotations
-
 import sys
 import tempfile
 from collections.abc import Iterator

@@ -4,8 +4,6 @@ Thresholds lie between the figures of real maps whose errors against ground trut
 maps made with wrong calibrations; they judge, and change nothing.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import html
 from collections.abc import Iterator

@@ -4,8 +4,6 @@ Three consecutive vertices give an acceleration, by their positions and by their
 positions is regressed on the other: positions are noisy, which leaves the slope as it is, samples hardly.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

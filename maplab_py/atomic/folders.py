@@ -5,8 +5,6 @@ the old folder is first moved aside, and `recover` moves it back if the program 
 renames.
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import os

@@ -1,7 +1,5 @@
 """Operating system calls for atomic writing: flushing, exchanging names, locks."""
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import logging

@@ -1,7 +1,5 @@
 """Least-squares alignment of point sets: rigid, similarity, or yaw and position."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

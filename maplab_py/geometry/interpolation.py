@@ -1,7 +1,5 @@
 """Interpolation of poses and vectors between time stamps."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

@@ -1,7 +1,5 @@
 """Rigid motions as rows [qx qy qz qw px py pz], with any number of leading batch axes."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -1,7 +1,5 @@
 """Rotations as unit quaternions [x y z w] (Hamilton), with any number of leading batch axes."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -3,8 +3,6 @@
 Rays of one point are consecutive rows; `start` (L + 1) holds the offsets, as everywhere.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

@@ -4,8 +4,6 @@ An element is a row [px py pz yaw] of T_A_B with both frames' z axes along gravi
 ``p_A = Rz(yaw) p_B + p``. The group is SE(2) x R; any number of leading batch axes.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -3,8 +3,6 @@
 maplab's model: w = T_g w_I + b_g, a = T_a R_A_I f_I + b_a, both T upper triangular, I = gyroscope frame.
 """
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

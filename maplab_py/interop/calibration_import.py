@@ -4,8 +4,6 @@ The format follows from the content, not from the name. Time shifts become the c
 t_imu = t_camera + offset.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from collections.abc import Callable, Sequence

@@ -5,8 +5,6 @@ mission; a landmark is listed with every mission that stores or observes it, so 
 observation finds its landmark.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterable, Iterator
 from itertools import chain

@@ -6,8 +6,6 @@ and `covariance` (36 numbers, position before orientation). Poses are `rotation_
 `translation_m`.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

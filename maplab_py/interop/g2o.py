@@ -5,8 +5,6 @@ Information matrices are of Log(T_measured^-1 T_A_B), position before angle, as 
 read them.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import zlib
 from collections.abc import Iterator

@@ -5,8 +5,6 @@ NMEA: sentences GGA of any talker have the fixes, or GNS where there are none, R
 no fixes are left out and counted by reason.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import datetime as dt
 import functools

@@ -5,8 +5,6 @@ Sources: ROS, sensor_msgs/image_encodings.hpp and compressed_image_transport (th
 ITU-T T.81.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import re
 import struct

@@ -1,7 +1,5 @@
 """IMU recordings in EuRoC's form: `t[ns], gyro x y z [rad/s], accel x y z [m/s^2]`, or with named columns."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from pathlib import Path

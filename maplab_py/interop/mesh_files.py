@@ -1,7 +1,5 @@
 """Triangle meshes as PLY, OBJ, STL and GLB files, the last three written and read by trimesh."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 from typing import Any

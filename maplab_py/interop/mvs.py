@@ -4,8 +4,6 @@ Sources: Furukawa and Ponce's documentation of PMVS-2 and CMVS; Snavely's of Bun
 look along -z with y up.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

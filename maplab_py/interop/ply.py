@@ -3,8 +3,6 @@
 Source: Greg Turk, The PLY Polygon File Format, 1994.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any

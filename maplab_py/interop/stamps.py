@@ -5,8 +5,6 @@ plausible: rows as far apart as such sensors deliver them, a date of this centur
 what is recorded beside it. Where several units remain, or none, the file is refused.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from collections.abc import Sequence

@@ -3,8 +3,6 @@
 `asl`: comma-separated poses in G and M, velocities and biases. `rpg`: TUM.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from itertools import chain
 from pathlib import Path

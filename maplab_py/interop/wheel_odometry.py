@@ -10,8 +10,6 @@ Columns of movements sideways (y, dy, vy) may be missing. Angles are radians, di
 header says otherwise.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from pathlib import Path

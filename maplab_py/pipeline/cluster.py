@@ -1,7 +1,5 @@
 """Orders on the workers of Dask distributed: processes of this machine, or of a scheduler's."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import logging

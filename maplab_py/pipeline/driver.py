@@ -1,7 +1,5 @@
 """The driver: which task is ready, which is finished already, and what follows a failure."""
 
-from __future__ import annotations
-
 import dataclasses
 import shutil
 import time

@@ -1,7 +1,5 @@
 """Execution of orders: in this process one after another, or on the workers of Dask."""
 
-from __future__ import annotations
-
 from collections import deque
 from typing import Protocol, Self
 

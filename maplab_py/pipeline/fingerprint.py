@@ -1,7 +1,5 @@
 """By which contents a finished task is known."""
 
-from __future__ import annotations
-
 import hashlib
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path

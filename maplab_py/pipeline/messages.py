@@ -1,7 +1,5 @@
 """Messages to a worker and back: folder names, lines of commands, flags and numbers."""
 
-from __future__ import annotations
-
 import dataclasses
 from enum import Enum
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Options of a pipeline run."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from maplab_py.errors import FlagError

@@ -1,7 +1,5 @@
 """Plan of a pipeline: stages of commands over maps, and their dependencies."""
 
-from __future__ import annotations
-
 import dataclasses
 import graphlib
 import re

@@ -1,7 +1,5 @@
 """Progress of a running pipeline, and its report."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path

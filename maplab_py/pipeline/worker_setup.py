@@ -1,7 +1,5 @@
 """Set-up of a local worker: Ctrl-C reaches all processes of a terminal, but the driver alone acts on it."""
 
-from __future__ import annotations
-
 import signal
 from typing import Any
 

@@ -4,8 +4,6 @@ A track consists of the observations of a landmark by one camera in consecutive 
 observations of the same landmark are another track: a filter does not store landmarks.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -5,8 +5,6 @@ the entropy of the calibration by more than a threshold. The cost grows with the
 segments; scores of single segments avoid this.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.algorithms.self_calibration.estimation.problem import build_segment_problem

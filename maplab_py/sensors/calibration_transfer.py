@@ -1,7 +1,5 @@
 """Transfer of a calibration from one set of sensors to another."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """One camera: projection, distortion and their parameters."""
 
-from __future__ import annotations
-
 import dataclasses
 from enum import Enum
 from typing import Any

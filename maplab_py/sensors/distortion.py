@@ -4,8 +4,6 @@ All radial models are written x_d = s(r) x with r = |x|, so that with s' = ds/dr
 dx_d/dx = s I + (s'/r) x x^T, where s and s'/r are smooth at r = 0.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 

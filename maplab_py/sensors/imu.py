@@ -1,7 +1,5 @@
 """The inertial measurement unit: noise, saturation, gravity, and scale / misalignment."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -8,8 +8,6 @@ x = p / D(p):
     extended unified (Khomutenko et al. 2016) D = alpha sqrt(beta (x^2 + y^2) + z^2) + (1 - alpha) z
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

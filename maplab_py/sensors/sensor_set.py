@@ -1,7 +1,5 @@
 """All sensors of a map and their extrinsics: the content of sensors.yaml."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from typing import Any

@@ -4,8 +4,6 @@ Keys that are not understood are kept at every level and written back. A mountin
 written back exactly as it was read while the pose it stands for is unchanged.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator, Mapping
 from pathlib import Path

@@ -3,8 +3,6 @@
 maplab has no such number; its entry of sensors.yaml gets a key `wheel_scale`, which C++ maplab ignores.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 from maplab_py.errors import MapError

@@ -5,8 +5,6 @@ of 32 decimal digits as an integer. Here only true / false, null, and numbers th
 the same value are converted; every other scalar stays text.
 """
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Requests to the server of a spool, as the commands send them."""
 
-from __future__ import annotations
-
 import json
 import urllib.error
 import urllib.parse

@@ -6,8 +6,6 @@ the new vertices and what they touch are optimised, everything else is held fixe
 on excerpts of bounded size. A joint optimisation closes the loops of the whole map and optimises it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import time

@@ -1,7 +1,5 @@
 """Options and reports of the map server."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

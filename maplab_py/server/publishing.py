@@ -3,8 +3,6 @@
 Only files that have changed are written; the others are linked from the folder that is replaced.
 """
 
-from __future__ import annotations
-
 import contextlib
 import shutil
 import time

@@ -14,8 +14,6 @@ waits for its neighbour. The loop itself is the only one that changes map, journ
 write into the folder of their submap, threads of the service read a published value.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import logging
 import queue

@@ -14,8 +14,6 @@
 Every step of a submap is one rename in the spool, so a crash leaves it in one folder or in the next.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import json

@@ -1,7 +1,5 @@
 """Submaps of robots: from a running odometry, and simulated ones for trials."""
 
-from __future__ import annotations
-
 import collections.abc
 import dataclasses
 import tempfile

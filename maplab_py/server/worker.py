@@ -6,8 +6,6 @@ Python and loading the compiled kernels takes five times as long as the work; wi
 while.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import logging

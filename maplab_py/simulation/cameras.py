@@ -1,7 +1,5 @@
 """Projection for the simulator, independent of the estimator's so that tests can compare both."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.array_types import F64

@@ -1,7 +1,5 @@
 """The demonstration: three drifting sessions, merged by the usual commands, against the truth."""
 
-from __future__ import annotations
-
 import shlex
 import tempfile
 import time

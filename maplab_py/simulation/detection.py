@@ -1,7 +1,5 @@
 """Simulated detector and tracker: detections of world points, joined to tracks that break."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Motion of a session: smoothly joined pieces along paths or from the current pose."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 

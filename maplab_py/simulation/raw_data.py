@@ -6,8 +6,6 @@ the scenario renders images, `data/<time stamp>.png`, and the true states as EuR
 along the optical axis, 16 bit), `truth/mesh.ply` the surfaces.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import os
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Reports of simulated data and of the demonstration on them."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

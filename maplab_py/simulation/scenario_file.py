@@ -1,7 +1,5 @@
 """Reading scenarios from YAML: every mistake is one line that names file and key."""
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 import types

@@ -1,7 +1,5 @@
 """Devices: the sensor set that the maps carry, and the true calibration, which differs."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Simulate a scenario: maps and their ground truth."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Self
 

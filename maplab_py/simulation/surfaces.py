@@ -1,7 +1,5 @@
 """Rectangular surfaces and the landmarks on them."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Motion along a recorded trajectory: a spline through its poses; the spline is the truth."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Ground truth of a simulated data set, stored separately from the maps."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Self

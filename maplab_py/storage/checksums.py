@@ -1,7 +1,5 @@
 """A side file with the checksum of every file of a map; C++ maplab ignores it."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re

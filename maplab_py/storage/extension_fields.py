@@ -3,8 +3,6 @@
 A map file holds them as length-delimited protobuf fields: programs that do not know them skip them.
 """
 
-from __future__ import annotations
-
 import zlib
 
 from maplab_py.errors import MapError

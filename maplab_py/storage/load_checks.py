@@ -1,7 +1,5 @@
 """Consistency checks of a map while it is loaded."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path

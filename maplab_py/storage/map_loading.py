@@ -1,7 +1,5 @@
 """Load a native map folder and convert its messages to a VI-map."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import gc

@@ -1,7 +1,5 @@
 """Save a map folder: lossless, as C++ maplab writes it, and atomically."""
 
-from __future__ import annotations
-
 import dataclasses
 import gzip
 import os

@@ -1,7 +1,5 @@
 """A side file with the names of a map's missions; C++ maplab ignores it."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Public entry to native map folders: load and find maps, detect changes by other programs."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from pathlib import Path

@@ -3,8 +3,6 @@
 Converting messages to columns holds Python's lock, so threads do not help.
 """
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import os

@@ -5,8 +5,6 @@ It skips `extras`: ids, landmark covariances, sensors, the descriptor projection
 file without extras is read too; localisation then needs the projection from elsewhere.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import gzip
 import hashlib

@@ -5,8 +5,6 @@ links are refused. Files of maps are replaced and never changed in place, so old
 backups that share a file keep it. A file that another program has changed is written again.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Comparison of maps for equal content."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from typing import Any

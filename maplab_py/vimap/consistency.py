@@ -1,7 +1,5 @@
 """Consistency checks of a map; every violation is listed with the affected ids."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Descriptor blocks of a frame: consecutive keypoints of one feature type and size."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from enum import IntEnum
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Edits of a map: functions return a new map that shares all unchanged columns."""
 
-from __future__ import annotations
-
 import hashlib
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Parts of a map that are edited alone, and their results written back into the map."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 from typing import Any

@@ -1,7 +1,5 @@
 """128-bit ids: two uint64 words, printed as 32 lower-case hexadecimal digits, all zero = invalid."""
 
-from __future__ import annotations
-
 import uuid
 from itertools import pairwise
 

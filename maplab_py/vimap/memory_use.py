@@ -1,7 +1,5 @@
 """Memory of the columns of several maps, shared ones counted once."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any

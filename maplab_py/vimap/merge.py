@@ -1,7 +1,5 @@
 """Merge the missions of one map into another."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

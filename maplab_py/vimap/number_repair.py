@@ -1,7 +1,5 @@
 """Removal of what is no number, so that the rest of a map can be loaded and saved."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Queries on a map that several algorithms and commands use."""
 
-from __future__ import annotations
-
 from collections import Counter
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Keep a subset of a map's entities, in any order, with every reference rewritten."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Join the sensors of two maps: equal calibrations are shared, different ones get new ids."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from typing import Any

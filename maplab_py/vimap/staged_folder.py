@@ -1,7 +1,5 @@
 """A temporary folder for resource files of maps that have not been saved yet."""
 
-from __future__ import annotations
-
 import shutil
 import tempfile
 import weakref

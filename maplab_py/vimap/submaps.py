@@ -1,7 +1,5 @@
 """Append a submap to its mission; neighbouring submaps share their boundary vertex."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

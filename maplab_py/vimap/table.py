@@ -1,7 +1,5 @@
 """Tables: frozen dataclasses of numpy arrays that share their first axis."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from typing import Any, Self

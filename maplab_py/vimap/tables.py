@@ -7,8 +7,6 @@ References between tables are row numbers (int32), `NO_ROW` where there is none.
 `unknown` keep, per row, the serialised fields of newer or foreign writers.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from enum import IntEnum
 from typing import Any

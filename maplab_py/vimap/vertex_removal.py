@@ -1,7 +1,5 @@
 """Remove vertices of missions: edges are joined, landmarks move to other store vertices."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Commands that anchor missions of unknown base frame to the known ones."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.algorithms.anchoring.absolute import AbsoluteAnchoringOptions

@@ -1,7 +1,5 @@
 """Loop closures between point clouds; maplab's lidar loop closure plugin."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from maplab_py.algorithms.cloud_registration.options import CloudClosureOptions, CloudClosureReport

@@ -1,7 +1,5 @@
 """Commands that exchange maps with COLMAP."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from maplab_py.interop.colmap.options import (

@@ -1,7 +1,5 @@
 """Commands that sparsify a map."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from maplab_py.algorithms.keyframing.options import KeyframingOptions, KeyframingReport

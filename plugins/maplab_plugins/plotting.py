@@ -1,7 +1,5 @@
 """Commands that draw a map into a file: PNG, SVG or PDF."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

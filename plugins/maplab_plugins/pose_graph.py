@@ -1,7 +1,5 @@
 """Commands that exchange pose graphs and loop closures with other programs."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Manipulation of the pose graph: uncertainties, switch variables, disturbed vertices."""
 
-from __future__ import annotations
-
 from maplab_py.algorithms.pose_graph_manipulation.edges import EdgeType
 from maplab_py.algorithms.pose_graph_manipulation.layout import (
     DisturbanceOptions,

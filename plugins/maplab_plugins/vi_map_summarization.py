@@ -1,7 +1,5 @@
 """Summary maps: the content of a map that localisation needs, in one small file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from maplab_py.algorithms.loop_closure.options import FeatureTypeOptions

@@ -1,7 +1,5 @@
 """Trajectories as absolute poses, odometry edges and missions, of good and of wrong files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Satellite positions: files, the frame that G becomes, and a drifting loop with outliers."""
 
-from __future__ import annotations
-
 import dataclasses
 import datetime as dt
 from pathlib import Path

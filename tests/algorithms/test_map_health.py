@@ -1,7 +1,5 @@
 """The doctor of maps: a sound map has no red light, each planted fault its own."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from html.parser import HTMLParser

@@ -1,7 +1,5 @@
 """Scale of maps against their accelerometers."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

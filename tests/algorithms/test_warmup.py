@@ -1,7 +1,5 @@
 """Kernels that are compiled before anybody waits for them."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.testing import assert_array_equal
 

@@ -1,7 +1,5 @@
 """Wheel odometry: files, edges of a mission, their scale, and bad input."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What is tested: under .ci/run the installed wheel and nothing of the checkout."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

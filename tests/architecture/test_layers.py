@@ -1,7 +1,5 @@
 """The layers of the architecture, and the size of its parts."""
 
-from __future__ import annotations
-
 import ast
 import subprocess
 import sys

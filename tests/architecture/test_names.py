@@ -1,7 +1,5 @@
 """Names say what a value is; docstrings open with a noun or a verb. CONTRIBUTING.md has the rules."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Iterator

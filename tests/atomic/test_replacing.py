@@ -1,7 +1,5 @@
 """Where writes go: through links, never onto devices, and never over what another process holds."""
 
-from __future__ import annotations
-
 import os
 import socket
 import stat

@@ -1,7 +1,5 @@
 """The bar of bags: 20,000 IMU messages are written in a second and read in another, equal to the last bit."""
 
-from __future__ import annotations
-
 import pytest
 
 from maplab_py.interop.recordings.bag_writing import BagFormat

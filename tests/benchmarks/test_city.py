@@ -1,7 +1,5 @@
 """The city of the benchmark: walks that meet, sessions that are kept, merges that are counted as wrong."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

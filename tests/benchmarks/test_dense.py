@@ -1,7 +1,5 @@
 """The bars of dense maps at full size: depth, meshes, poses of optvi, and the time against Open3D."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Figures over releases: which changes are regressions, and the table of the page."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Place recognition on recorded maps against exhaustive search, and what tells look-alikes apart."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

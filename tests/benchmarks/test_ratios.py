@@ -1,7 +1,5 @@
 """Ratios to the peers stay below wide bounds, and what the benchmarks count."""
 
-from __future__ import annotations
-
 import pytest
 
 from benchmarks.comparison import PEER, compare, scaling_exponent

@@ -1,7 +1,5 @@
 """The page "from COLMAP to a summary map", on a model of rendered images with SIFT features."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """The example distribution of docs/writing_plugins.md, installed and run as a stranger's plugin."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """The migration pages account for every command and every flag of maplab."""
 
-from __future__ import annotations
-
 import re
 from types import ModuleType
 from typing import Any

@@ -3,8 +3,6 @@
 The environment has nothing of this one but the libraries, which would take minutes to download.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

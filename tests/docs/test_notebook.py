@@ -1,7 +1,5 @@
 """The notebook is stored with its pictures and runs from its first to its last cell."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 from pathlib import Path

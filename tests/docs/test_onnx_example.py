@@ -1,7 +1,5 @@
 """The example plugin that runs a network, installed and run with one that the test writes."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The documentation does what it says: commands run, links lead somewhere, pages are up to date."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 from pathlib import Path

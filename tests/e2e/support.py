@@ -1,7 +1,5 @@
 """The real program: as a child process, or in a pseudo-terminal with a screen."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

@@ -1,7 +1,5 @@
 """Workflows on recorded maps under the arithmetic of several processors: same decisions, same digits."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Iterator

@@ -3,8 +3,6 @@
 All commands: `python -m benchmarks.interruptions`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

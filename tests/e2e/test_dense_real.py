@@ -1,7 +1,5 @@
 """Depth of recorded stereo images against the landmarks of the map."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

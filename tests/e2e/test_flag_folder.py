@@ -1,7 +1,5 @@
 """Every file in flags/: its commands and flags exist, and the scripts do their work on real maps."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Scripts that are killed, terminated or fail at any step: what they made until then can be loaded."""
 
-from __future__ import annotations
-
 import signal
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The program without a terminal: scripts, streams, statuses, start-up time."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

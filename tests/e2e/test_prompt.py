@@ -1,7 +1,5 @@
 """The interactive console, key by key, in a pseudo-terminal."""
 
-from __future__ import annotations
-
 import re
 import shutil
 from collections.abc import Iterator

@@ -4,8 +4,6 @@ Truth for EuRoC V1_01: O is the file as shipped (it errs by about 0.037 m itself
 one. Errors are APE RMSE after SE(3) alignment.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path

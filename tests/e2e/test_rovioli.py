@@ -1,7 +1,5 @@
 """rovioli in a terminal: the status line, and Ctrl-C that keeps what is there."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What a person sees in a narrow terminal: whole words, one table per thing, names."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

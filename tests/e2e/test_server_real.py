@@ -1,7 +1,5 @@
 """The server with real processes and maps: killed again and again, and as accurate as promised."""
 
-from __future__ import annotations
-
 import pytest
 
 from benchmarks.server.euroc import measure_euroc

@@ -1,7 +1,5 @@
 """The tour from its first to its last step, in a pseudo-terminal."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

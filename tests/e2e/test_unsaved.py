@@ -1,7 +1,5 @@
 """The interactive console: unsaved changes, the history of the tutorial."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

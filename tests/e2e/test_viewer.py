@@ -1,7 +1,5 @@
 """The viewer beside a real prompt."""
 
-from __future__ import annotations
-
 import re
 import socket
 import urllib.request

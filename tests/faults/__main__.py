@@ -4,8 +4,6 @@ Each run is a fork of this process, in a fresh copy of the old state. Printed is
 scenario: the calls, how many faults were injected, and every broken promise.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import errno
 import gc

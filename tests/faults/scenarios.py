@@ -1,7 +1,5 @@
 """What is saved under faults: maps, databases, summary maps, output files, files of the console."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 from collections.abc import Callable

@@ -5,8 +5,6 @@ in a forked child only. Counted are calls below one folder, in the order of the 
 same n is the same call in every run.
 """
 
-from __future__ import annotations
-
 import builtins
 import contextlib
 import ctypes

@@ -1,7 +1,5 @@
 """The injector counts every call that strace sees."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Old or new, never neither, and nothing left behind, whatever call of a save fails or is the last."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Messages of running robots: headers of TCPROS, IMU samples and images of ROS 1 and in CDR."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Mutations that keep the form of an input: words and lines of text, pieces of bytes."""
 
-from __future__ import annotations
-
 import random
 import re
 import struct

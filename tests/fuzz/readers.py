@@ -4,8 +4,6 @@ An input is the content of one file. Where a reader knows several kinds of files
 among their names.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import json

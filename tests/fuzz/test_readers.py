@@ -1,7 +1,5 @@
 """Readers on their valid inputs, on mutations of them, and on what fuzzing once found."""
 
-from __future__ import annotations
-
 import os
 import random
 import subprocess

@@ -1,7 +1,5 @@
 """Alignment of positions, alone and about the vertical."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Poses: group, exponential, Jacobians, interpolation."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Rotations: group axioms, exp and log everywhere, Jacobians against numeric differences."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Points of rays, and functions of symmetric matrices."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

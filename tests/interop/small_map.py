@@ -1,7 +1,5 @@
 """A small map of two missions with every kind of row that the exporters read."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.geometry import se3, so3

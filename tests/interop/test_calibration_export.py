@@ -1,7 +1,5 @@
 """Exports mean the same device: each format's own model is applied to motions and compared."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Calibration files of other programs: small files of every format, exports read back, wrong files."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

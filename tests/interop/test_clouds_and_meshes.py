@@ -1,7 +1,5 @@
 """PLY in all encodings, PCD of every type, meshes in every format."""
 
-from __future__ import annotations
-
 import json
 import tracemalloc
 from pathlib import Path

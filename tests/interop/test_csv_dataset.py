@@ -1,7 +1,5 @@
 """maplab's CSV data set and G2O graphs, read back without the product."""
 
-from __future__ import annotations
-
 import dataclasses
 import gzip
 from pathlib import Path

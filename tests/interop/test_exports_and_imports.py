@@ -1,7 +1,5 @@
 """Every export is read by every import of its kind; values are equal to the precision of the format."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

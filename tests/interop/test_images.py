@@ -1,7 +1,5 @@
 """Pixels of every encoding: converted, or refused by name."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2

@@ -1,7 +1,5 @@
 """COLMAP's own library reads the model; it runs in a process of its own, which has not imported cv2."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

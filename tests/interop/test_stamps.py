@@ -1,7 +1,5 @@
 """Time stamps as text: exact, in the unit of header or plausibility, or refused by name."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tables of other programs: names and units of columns, dates, quotes, decimal commas, encodings."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Trajectory files: every format, exact times, clear refusals; maplab's two exports."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

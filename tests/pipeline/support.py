@@ -1,7 +1,5 @@
 """Small maps, and pipelines over them."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Pipelines on Dask: a lost worker, Ctrl-C, a killed driver, a real scheduler on loopback."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """Plans of stages, and batches that run, fail and are resumed."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Figures show what is in the map: looked up in the artists, and written as real files."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 from typing import Any

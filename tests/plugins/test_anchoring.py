@@ -1,7 +1,5 @@
 """The anchoring commands, through the session."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

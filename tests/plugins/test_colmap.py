@@ -1,7 +1,5 @@
 """COLMAP models and files for dense reconstruction, out and in through the session."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The commands that read and write files of other programs."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

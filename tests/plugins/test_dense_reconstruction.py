@@ -1,7 +1,5 @@
 """From stereo images to a mesh in the console, with undo, a new process, and bad input."""
 
-from __future__ import annotations
-
 import errno
 import gc
 import shutil

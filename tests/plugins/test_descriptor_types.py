@@ -1,7 +1,5 @@
 """Commands on maps with descriptors of several types, from files in both layouts."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The evaluation command, called as a function and through its flags."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Localisation in summary maps, of sessions and of rovioli, through the console."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

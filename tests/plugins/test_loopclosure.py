@@ -1,7 +1,5 @@
 """The loop closure and relaxation commands through the session, of images and of clouds."""
 
-from __future__ import annotations
-
 import io
 import sys
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Removal of missions, by ids and by questions, and the state of base frames."""
 
-from __future__ import annotations
-
 import pytest
 from maplab_plugins.visualization.following import Following
 

@@ -1,7 +1,5 @@
 """Pose graphs of other programs, and commands on edges, vertices and missions, through the session."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

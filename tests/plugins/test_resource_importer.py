@@ -1,7 +1,5 @@
 """The commands of resources in the console: import, undo, save, check, remove, clean up."""
 
-from __future__ import annotations
-
 import gc
 import tempfile
 from collections.abc import Iterator

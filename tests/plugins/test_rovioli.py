@@ -1,7 +1,5 @@
 """The command rovioli: from a recording to a map that the other commands take."""
 
-from __future__ import annotations
-
 import tempfile
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The self-calibration commands, through the session."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading

@@ -1,7 +1,5 @@
 """The commands simulate, list_scenarios, evaluate_map and demo, as they are typed."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

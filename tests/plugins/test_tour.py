@@ -1,7 +1,5 @@
 """The tour checks what was typed, says what is missing, and survives other commands."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

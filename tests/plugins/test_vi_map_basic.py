@@ -1,7 +1,5 @@
 """Maps in memory, and their loading and saving."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from typing import Any

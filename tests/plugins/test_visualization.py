@@ -1,7 +1,5 @@
 """The visualisation commands, through the session."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A map with a resource of every type that commands show."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

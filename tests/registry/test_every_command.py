@@ -1,7 +1,5 @@
 """What every command owes its user; holds for commands that are yet to be written."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys

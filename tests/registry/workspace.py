@@ -4,8 +4,6 @@ A new command whose example needs something that is not here gets it here: a fil
 `make_workspace`, or lines that are typed first in `PREPARED`.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The joint filter, a baseline: exact without noise, about as good as it says with it."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Camera models against OpenCV, numeric differences and their own inverses."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import cv2

@@ -1,7 +1,5 @@
 """sensors.yaml: real files, every kind of key, every kind of mistake."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Small submaps of two robots, and servers whose workers are functions of this process."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import importlib

@@ -1,7 +1,5 @@
 """What a server refuses, each with one line, while the merged map stays valid."""
 
-from __future__ import annotations
-
 import dataclasses
 import shutil
 from collections import Counter

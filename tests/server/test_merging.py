@@ -1,7 +1,5 @@
 """The joint step of the server: what is aligned, relaxed, anchored and shown."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

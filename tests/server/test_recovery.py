@@ -1,7 +1,5 @@
 """A server that ends at any point goes on where it was: every submap is in the map once."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import shutil

@@ -1,7 +1,5 @@
 """The server: order, publication, deletion, requests, and who may ask."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import threading

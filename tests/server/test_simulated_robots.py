@@ -1,7 +1,5 @@
 """Recorded and simulated sessions that come into a spool."""
 
-from __future__ import annotations
-
 import dataclasses
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Workers are processes that stay: what they make, and what becomes of those that die."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import signal

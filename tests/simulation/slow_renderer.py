@@ -3,8 +3,6 @@
 It handles all pixels of an image at a time and box after box: plain, and thirty times slower.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """A scenario that is simulated in a fraction of a second."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib.util
 from functools import cache

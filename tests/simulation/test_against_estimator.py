@@ -3,8 +3,6 @@
 Without noise the estimator's residuals vanish at the truth, with noise they have the announced size.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

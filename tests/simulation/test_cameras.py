@@ -1,7 +1,5 @@
 """Projection against OpenCV's and the estimator's, descriptors by view, and landmarks on surfaces."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a tracker gets wrong: drifting tracks, moving things, rolling shutters, coarse octaves."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Truth files, errors against them, and evaluate_map, which sees every kind of error."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The compiled ray caster against a plain one, and images against depth, geometry and OpenCV."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import cache
 from pathlib import Path

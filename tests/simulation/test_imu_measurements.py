@@ -1,7 +1,5 @@
 """The IMU's model, its noise by Allan deviations, and integrals that lead back to the motion."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

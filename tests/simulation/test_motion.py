@@ -1,7 +1,5 @@
 """Motions and their splines: derivatives, no jerk, recorded trajectories."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

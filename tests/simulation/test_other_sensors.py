@@ -1,7 +1,5 @@
 """Lidar, absolute poses, odometry, wheels, loop closure edges: right mean, size and share."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

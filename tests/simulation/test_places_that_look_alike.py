@@ -1,7 +1,5 @@
 """Worlds with places that look alike, and streets: what repeats, what differs, and where one can walk."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Flights along recorded trajectories: their common frame, and the IMU samples recorded with them."""
 
-from __future__ import annotations
-
 import dataclasses
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Rendered sessions: brightness, repainted and bare surfaces, files, and recordings to read again."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import cache
 from pathlib import Path

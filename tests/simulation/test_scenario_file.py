@@ -1,7 +1,5 @@
 """Scenarios in YAML: those that come along load; a mistake is one line that names file and key."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

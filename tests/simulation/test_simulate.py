@@ -1,7 +1,5 @@
 """Whole sessions: consistent, exact at truth without noise, repeatable; the demonstration."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from pathlib import Path

@@ -1,7 +1,5 @@
 """After the warmup, rendering compiles nothing."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Every way to damage a map that tests know, and what must be said about it."""
 
-from __future__ import annotations
-
 import gzip
 from typing import Any
 

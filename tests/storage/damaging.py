@@ -1,7 +1,5 @@
 """A small map with everything in it, and the tools to damage it."""
 
-from __future__ import annotations
-
 import dataclasses
 import gzip
 import struct

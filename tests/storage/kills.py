@@ -4,8 +4,6 @@ Each save runs in a fork of this process, which ends by SIGKILL somewhere betwee
 after the usual end. Printed is one line of JSON: what each kill has left, "old", "new", or what is wrong.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os

@@ -1,7 +1,5 @@
 """Damaged files and entries that are no numbers: one line with file and field, or repaired."""
 
-from __future__ import annotations
-
 import gzip
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Both layouts of descriptors go through load and save byte for byte; damaged blocks are refused."""
 
-from __future__ import annotations
-
 import shutil
 import struct
 import tracemalloc

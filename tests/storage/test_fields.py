@@ -1,7 +1,5 @@
 """Fields of the format: optional ones, those of other programs, and names of missions."""
 
-from __future__ import annotations
-
 import gzip
 from collections.abc import Callable
 from pathlib import Path

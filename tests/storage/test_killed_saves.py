@@ -1,7 +1,5 @@
 """A save of new resources that is killed leaves the old or the new map, with all its files."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """The cache of loaded maps: equal to the files, and never trusted when something is wrong with it."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from collections.abc import Callable

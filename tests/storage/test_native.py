@@ -1,7 +1,5 @@
 """Real maps go through load and save without loss; damaged ones are refused in one line."""
 
-from __future__ import annotations
-
 import dataclasses
 import gzip
 import os

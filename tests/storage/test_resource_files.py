@@ -1,7 +1,5 @@
 """Resources: every type, new ones until the save, bounded memory, copies and moves."""
 
-from __future__ import annotations
-
 import dataclasses
 import errno
 import gc

@@ -1,7 +1,5 @@
 """The summary map file: what is written is read, other programs' files too, damage is named."""
 
-from __future__ import annotations
-
 import dataclasses
 import gzip
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Files that the next save takes over, and those that other processes and threads read."""
 
-from __future__ import annotations
-
 import dataclasses
 import errno
 import functools

@@ -1,7 +1,5 @@
 """The studies run, continue where they stopped, and make the page of results."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import shutil

@@ -1,7 +1,5 @@
 """Association of the time stamps of two recordings, as evo does it."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -1,7 +1,5 @@
 """What a run of the tests did not cover, since the machine lacks something."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable
 

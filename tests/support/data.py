@@ -1,7 +1,5 @@
 """Where tests find the real recordings; nothing of them is part of the project."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -4,8 +4,6 @@ Reprojection uses the camera models of `sensors`, not the compiled kernels; othe
 residuals and everything else is done by differences and dense algebra.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -3,8 +3,6 @@
 Nothing of the program is used but the generated messages.
 """
 
-from __future__ import annotations
-
 import gzip
 import shutil
 import struct

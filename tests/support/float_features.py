@@ -1,7 +1,5 @@
 """Maps whose binary descriptors are exchanged for descriptors of numbers that mean the same."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

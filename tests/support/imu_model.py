@@ -4,8 +4,6 @@ Schneider 2019, eq. (7.7)-(7.10): w_measured = T_g w_I + b_g, a_measured = T_a R
 f_I = R_I_G (a_G - g_G) is the specific force in the IMU frame.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 

@@ -1,7 +1,5 @@
 """Ctrl-C at several moments of a command, in the real console in a pseudo-terminal."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import re

@@ -1,7 +1,5 @@
 """How fast this machine is just now, so that bars in seconds mean the same on every one."""
 
-from __future__ import annotations
-
 import os
 import resource
 import subprocess

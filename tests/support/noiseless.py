@@ -1,7 +1,5 @@
 """Scenarios without errors of measurements."""
 
-from __future__ import annotations
-
 import dataclasses
 
 from maplab_py.simulation.scenario import CalibrationOptions, Scenario

@@ -1,7 +1,5 @@
 """Measure memory in a process of its own, where no other test has threads or garbage left."""
 
-from __future__ import annotations
-
 import multiprocessing
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor

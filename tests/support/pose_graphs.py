@@ -3,8 +3,6 @@
 Poses are chained along the odometry, as they are in the public files of a torus, a sphere and a grid.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """Programs of the tests that run in a process of their own."""
 
-from __future__ import annotations
-
 import sys
 
 from tests.support.data import REPOSITORY

@@ -6,8 +6,6 @@ that `estimation.imu.kernels` states, and the samples by solving that rule for w
 Nothing here uses the code under test but the camera models of `sensors`.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

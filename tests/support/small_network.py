@@ -1,7 +1,5 @@
 """A network in the ONNX format that finds contrasts and describes them by a few fixed filters."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

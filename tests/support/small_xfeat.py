@@ -1,7 +1,5 @@
 """Random weights of the network XFeat, and checkpoints as PyTorch writes them, without it."""
 
-from __future__ import annotations
-
 import io
 import itertools
 import pickle

@@ -1,7 +1,5 @@
 """Commands for tests of the whole console: what the session holds, and putting it back."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from maplab_py.console.session.maps import MapsState

@@ -1,7 +1,5 @@
 """A mission of several submaps, as robots send them."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 

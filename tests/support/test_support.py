@@ -1,7 +1,5 @@
 """What tests rely on: association, IMU model, collection, waiting, planted faults."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

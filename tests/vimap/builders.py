@@ -1,7 +1,5 @@
 """Small exact maps: a camera on an IMU walks past random points, one map or several pieces."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.geometry import se3, so3

@@ -1,7 +1,5 @@
 """Descriptors of several types, 3D positions and time offsets stay with their keypoints."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Edits of maps, parts of them, and what they hold."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

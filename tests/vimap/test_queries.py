@@ -1,7 +1,5 @@
 """Queries, rows by id, and maps that are the same."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

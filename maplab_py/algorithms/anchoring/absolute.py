@@ -5,8 +5,6 @@ come before anchoring by places. The alignment is the smallest sum of distances,
 measurements may miss; it needs no random samples.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

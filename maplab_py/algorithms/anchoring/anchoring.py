@@ -5,8 +5,6 @@ are aligned and compared first, the tree takes pairs in order of inliers, and th
 that are consistent with the tree.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Maps in cells: splitting, and joining of cells."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from functools import reduce

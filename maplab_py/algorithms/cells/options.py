@@ -1,7 +1,5 @@
 """Options of the split into cells."""
 
-from __future__ import annotations
-
 from maplab_py.options import Options, option
 
 

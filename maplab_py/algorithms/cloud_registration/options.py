@@ -1,7 +1,5 @@
 """Options of loop closures between point clouds, and what the search reports."""
 
-from __future__ import annotations
-
 import dataclasses
 
 from maplab_py.errors import FlagError

@@ -4,8 +4,6 @@ Sources: Segal, Haehnel and Thrun, Generalized-ICP (RSS 2009); small_gicp (Koide
 Perturbations of poses are on the right, [dp, dtheta], both in the frame of the source.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from functools import cache
 from typing import Any

@@ -1,7 +1,5 @@
 """Depth maps as point clouds, and clouds of a camera as depth maps."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Depth of rectified stereo images by OpenCV's block matching."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Any

@@ -1,7 +1,5 @@
 """Euclidean signed distance fields: every observed voxel's distance from the nearest surface."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

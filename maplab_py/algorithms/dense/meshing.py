@@ -1,7 +1,5 @@
 """The mesh of the grids of a map."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

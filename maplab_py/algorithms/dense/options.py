@@ -1,7 +1,5 @@
 """Options of dense reconstruction; names are those of maplab where it has them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from maplab_py.errors import FlagError

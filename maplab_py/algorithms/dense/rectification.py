@@ -5,8 +5,6 @@ project's own camera models, so that equidistant, FOV and unified cameras work a
 Source: Fusiello et al., A compact algorithm for rectification of stereo pairs, 2000.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Images and depth of the frames of a map, read from its resources."""
 
-from __future__ import annotations
-
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Poses in a map against ground truth, without aligning them: they claim to be in the map's frame."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

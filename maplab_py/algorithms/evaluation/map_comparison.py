@@ -1,7 +1,5 @@
 """Differences of two maps: rows by their ids, then poses, landmarks, keypoints, observations."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Options of trajectory evaluation."""
 
-from __future__ import annotations
-
 from maplab_py.interop.stamps import time_unit_option
 from maplab_py.options import Options, option
 

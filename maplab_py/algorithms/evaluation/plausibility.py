@@ -3,8 +3,6 @@
 Both are found by trying them; nothing is changed, a hint names the reading and the error that it would have.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

@@ -3,8 +3,6 @@
 Following Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, IROS 2012.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.algorithms.evaluation.options import ALIGNMENTS

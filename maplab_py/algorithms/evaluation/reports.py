@@ -1,7 +1,5 @@
 """Report of trajectory evaluation."""
 
-from __future__ import annotations
-
 import dataclasses
 
 from maplab_py.report import Report

@@ -1,7 +1,5 @@
 """Compare a map's vertices with a ground-truth trajectory."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Alignment of missions with measured positions: yaw and position of the base frame."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -4,8 +4,6 @@ Positions are stored as absolute poses whose orientation is the estimated one wi
 1000 rad: it weighs nothing, and the format needs no type of its own.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

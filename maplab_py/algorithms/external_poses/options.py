@@ -1,7 +1,5 @@
 """Options and reports of poses from other sources."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

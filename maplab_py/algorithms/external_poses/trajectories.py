@@ -1,7 +1,5 @@
 """Trajectories of other programs as absolute poses, odometry edges, or missions."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 from collections.abc import Mapping

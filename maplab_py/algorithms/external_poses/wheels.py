@@ -1,7 +1,5 @@
 """Wheel odometry as edges between neighbouring vertices of a mission."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Compute keypoints and descriptors from the images of a map."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

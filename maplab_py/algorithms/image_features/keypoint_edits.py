@@ -1,7 +1,5 @@
 """Add keypoints to frames and remove them; every block of a frame has descriptors of one kind."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Options of the extraction of features and of their tracks."""
 
-from __future__ import annotations
-
 import dataclasses
 
 from maplab_py.errors import FlagError

@@ -1,7 +1,5 @@
 """Link keypoints of neighbouring frames into tracks, from which landmarks can be made."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

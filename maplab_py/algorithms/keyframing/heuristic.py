@@ -1,7 +1,5 @@
 """Heuristic keyframing: keep vertices of each mission that add new information."""
 
-from __future__ import annotations
-
 from enum import IntEnum
 
 import numpy as np

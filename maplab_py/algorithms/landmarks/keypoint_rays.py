@@ -1,7 +1,5 @@
 """Rays of keypoints in the body frame, and the angle that a pixel covers."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

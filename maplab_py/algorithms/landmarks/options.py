@@ -1,7 +1,5 @@
 """Options of the landmark algorithms; maplab's names and defaults."""
 
-from __future__ import annotations
-
 import dataclasses
 
 from maplab_py.errors import FlagError

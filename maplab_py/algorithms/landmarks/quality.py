@@ -1,7 +1,5 @@
 """Landmark quality: tests whether landmarks are well constrained by the geometry of their rays."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Remove bad landmarks, and observations that contradict their landmark."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.algorithms.landmarks.options import (

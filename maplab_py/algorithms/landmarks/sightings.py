@@ -1,7 +1,5 @@
 """Observations as geometry: rays in G, points in camera frames, reprojection errors."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 

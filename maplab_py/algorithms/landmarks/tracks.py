@@ -1,7 +1,5 @@
 """Create landmarks from feature tracks without landmark."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions, TrackReport

@@ -1,7 +1,5 @@
 """Triangulate landmarks again from the rays of their observations."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions, RetriangulationReport

@@ -1,7 +1,5 @@
 """Localisation database: landmarks and descriptors of a full map or a summary map."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import cached_property
 

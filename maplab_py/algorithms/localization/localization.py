@@ -1,7 +1,5 @@
 """Localise all vertices of some missions in a map, and compare with a reference."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections.abc import Iterator

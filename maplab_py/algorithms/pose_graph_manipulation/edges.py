@@ -1,7 +1,5 @@
 """Uncertainties and switch variables of edges."""
 
-from __future__ import annotations
-
 from enum import Enum
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Spread missions with unknown base frame in space for visualisation."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

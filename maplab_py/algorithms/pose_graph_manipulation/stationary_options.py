@@ -1,7 +1,5 @@
 """Criteria for a mission at rest, with maplab's flag names."""
 
-from __future__ import annotations
-
 from maplab_py.options import Options
 
 

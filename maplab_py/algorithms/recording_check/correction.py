@@ -1,7 +1,5 @@
 """A calibration with what a recording has shown: mounting, time offset, line delay, scale, noise."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The doctor: all checks of a recording, causes before effects, and the line that a run says of them."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator, Sequence
 

@@ -1,7 +1,5 @@
 """Findings of the checks, their order, and the report on a recording."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from enum import Enum

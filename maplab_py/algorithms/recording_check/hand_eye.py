@@ -1,7 +1,5 @@
 """The gyroscope against the images: first a linear map of the rates, then all unknowns together."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 

@@ -1,7 +1,5 @@
 """Checks of what images show: light, sharpness, texture, and whether they change."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

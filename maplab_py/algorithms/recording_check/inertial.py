@@ -1,7 +1,5 @@
 """The IMU by itself: magnitudes, noise, and whether accelerometer and gyroscope have the same axes."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Checks of the IMU: units, magnitude, signs, axes, and noise against the figures."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

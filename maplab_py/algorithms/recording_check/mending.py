@@ -1,7 +1,5 @@
 """A recording that is read with what its check has shown: units, axes, calibration."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """The turn of a camera against the gyroscope, taken apart into unit, axes, mounting and time."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

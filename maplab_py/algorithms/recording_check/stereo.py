@@ -1,7 +1,5 @@
 """The geometry of two cameras against the points that both see."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Checks of times: parts, spans, rates, gaps, and partners of images."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

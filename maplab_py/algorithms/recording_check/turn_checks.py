@@ -1,7 +1,5 @@
 """Checks of the gyroscope against the turns of the images: unit, axes, clock, mounting, scale, shutter."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Pose graphs of other programs: optimise them as they are, or turn them into maps and back."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 from typing import Any

@@ -3,8 +3,6 @@
 Residuals are split: the position part is in A, the angular part in B, W^T W = covariance^-1.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.algorithms.relaxation.options import RelaxationOptions

@@ -17,8 +17,6 @@ constraints of this call only and are not added to the map. The map's own loop-c
 count and stay in the map, their switch variables telling what became of them.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import time
 

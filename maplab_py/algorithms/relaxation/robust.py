@@ -4,8 +4,6 @@ Far from the answer a true closure looks as false as a false one. So a loss begi
 count and becomes stricter step by step (graduated non-convexity: Yang et al., RA-L 2020).
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Options of landmark sparsification; maplab's names and defaults where it has them."""
 
-from __future__ import annotations
-
 import dataclasses
 
 from maplab_py.errors import FlagError

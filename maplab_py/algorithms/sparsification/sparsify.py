@@ -1,7 +1,5 @@
 """Keep the landmarks that are most useful for localisation and remove all others."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

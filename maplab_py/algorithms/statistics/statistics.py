@@ -1,7 +1,5 @@
 """Statistics of maps: distributions, and the sizes of their parts."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Options of summary maps."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

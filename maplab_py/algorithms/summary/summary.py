@@ -1,7 +1,5 @@
 """Create a summary map: good landmarks in G, their projected descriptors and observers."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Create a localisation map from raw sessions: maplab's workflow for any number of missions."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections.abc import Callable

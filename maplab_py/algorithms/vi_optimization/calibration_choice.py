@@ -6,8 +6,6 @@ one after the other, by what they gain beside those chosen already, since a wron
 rotation, too.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

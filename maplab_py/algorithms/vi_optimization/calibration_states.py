@@ -1,7 +1,5 @@
 """Convert cameras, IMUs and extrinsics of a map to parameter blocks and back."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Select the vertices, landmarks and observations of a map that an optimisation uses."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

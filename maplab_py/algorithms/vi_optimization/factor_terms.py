@@ -1,7 +1,5 @@
 """Factor terms of a map: inertial, odometry, loop closures, absolute poses."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Fixed states of a problem: the gauge of every cluster of vertices, and states without a term."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.array_types import I64

@@ -1,7 +1,5 @@
 """Choose the linear solver of a map's problem (`--ba_linear_solver_type`, `--ba_max_memory_gb`)."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 from collections.abc import Callable, Sequence

@@ -7,8 +7,6 @@ all states given those of the fixed vertices: what an error of theirs means is l
 optimisation.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

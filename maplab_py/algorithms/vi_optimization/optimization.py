@@ -1,7 +1,5 @@
 """Visual-inertial least squares over a map: build the problem, solve it, apply the result."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections.abc import Callable

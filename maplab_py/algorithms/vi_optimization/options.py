@@ -1,7 +1,5 @@
 """Flags of optvi and optv, with maplab's names."""
 
-from __future__ import annotations
-
 from maplab_py.errors import FlagError
 from maplab_py.options import Options, option
 from maplab_py.vimap.descriptors import type_of_name

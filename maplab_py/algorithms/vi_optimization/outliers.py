@@ -1,7 +1,5 @@
 """Outlier rejection of observations: initial gate and tests while solving."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

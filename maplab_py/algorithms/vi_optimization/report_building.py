@@ -1,7 +1,5 @@
 """Build the report of an optimisation."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.algorithms.vi_optimization import reports

@@ -1,7 +1,5 @@
 """Reports of the optimisation of a map."""
 
-from __future__ import annotations
-
 import dataclasses
 
 from maplab_py.report import Report

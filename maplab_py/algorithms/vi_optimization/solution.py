@@ -1,7 +1,5 @@
 """Apply optimised states to the map of the problem."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.algorithms.vi_optimization import calibration_states

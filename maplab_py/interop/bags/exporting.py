@@ -1,7 +1,5 @@
 """A mission of a map as a bag: poses, IMU samples, and the images and clouds among its resources."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Content of a bag, whatever its messages are."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

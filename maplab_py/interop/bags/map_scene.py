@@ -1,7 +1,5 @@
 """A whole map as an mcap recording, for Foxglove and other viewers of robotics."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

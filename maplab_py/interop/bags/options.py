@@ -1,7 +1,5 @@
 """Options and reports of maps in bags."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path

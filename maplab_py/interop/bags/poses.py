@@ -1,7 +1,5 @@
 """Poses of a map as messages, and a bag copied with them (maplab's pose_to_bag)."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections import Counter
 from collections.abc import Iterator

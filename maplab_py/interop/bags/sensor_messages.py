@@ -1,7 +1,5 @@
 """Images, calibrations and point clouds as serialised messages, and back."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -4,8 +4,6 @@ Basalt corrects f_i = (1 + S_a) a - b_a and w_i = (1 + S_g) w - b_g, with S_a lo
 cameras are `T_imu_cam` on its frame i (basalt-headers, calib_bias.hpp and calibration.hpp).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.array_types import F64

@@ -3,8 +3,6 @@
 `T_BS` is the pose of a sensor on the body B of all sensors of a folder.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -5,8 +5,6 @@ measurements are w = W w_i + b_g and a = A f_i + b_a. Ours are in the frame I in
 upper triangular: W = T_g R_I_i and A = T_a R_A_I R_I_i; both are RQ decompositions.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import re
 

@@ -1,7 +1,5 @@
 """Camera models under the names of other programs, and what their entries have in common."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -4,8 +4,6 @@ OKVIS' `T_SC` is the pose of a camera on the IMU S; SVO's `T_B_C` that on its bo
 delay from the stamps of images to get to the clock of the IMU.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Content of a calibration file before its sensors get ids, and the text files it comes from."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re

@@ -4,8 +4,6 @@
 biases are subtracted afterwards.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.array_types import F64

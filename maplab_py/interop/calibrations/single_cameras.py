@@ -1,7 +1,5 @@
 """Files of one camera without its pose: ROS' CameraInfo, OpenCV's calibration, DSO's and DM-VIO's text."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from pathlib import Path

@@ -4,8 +4,6 @@
 `acc_n`, `gyr_n` are standard deviations of samples, which they use like densities.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -4,8 +4,6 @@ Some functions of pycolmap abort a process that has imported cv2; nothing here i
 writes files in its folder.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

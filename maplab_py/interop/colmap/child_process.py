@@ -1,7 +1,5 @@
 """Run pycolmap in a child process."""
 
-from __future__ import annotations
-
 import logging
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Descriptors, scales and images of an imported model, from COLMAP's database and image folders."""
 
-from __future__ import annotations
-
 import dataclasses
 import sqlite3
 from pathlib import Path

@@ -5,8 +5,6 @@ T_A_B. Keypoints are in COLMAP's pixels: the centre of the first pixel is at (0.
 Source: COLMAP's documentation, "Output Format", of version 4.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import io
 from enum import IntEnum

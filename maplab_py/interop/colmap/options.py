@@ -1,7 +1,5 @@
 """Options and reports of the exchange with COLMAP."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Read the model of a folder, in either format, and check the references within it."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 import struct

@@ -1,7 +1,5 @@
 """A map of a COLMAP model: a mission of each rig, odometry between its frames, landmarks."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 

@@ -1,7 +1,5 @@
 """Perspective cameras and undistorted keypoints, of models to import and of maps to export."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path

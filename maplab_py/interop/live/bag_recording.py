@@ -1,7 +1,5 @@
 """Recording of topics to a bag while messages arrive."""
 
-from __future__ import annotations
-
 import dataclasses
 import queue
 import time

@@ -1,7 +1,5 @@
 """Connecting to the topics of a robot."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import time

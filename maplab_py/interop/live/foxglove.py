@@ -3,8 +3,6 @@
 Source: github.com/foxglove/ws-protocol, "docs/spec.md". Needs the library websockets (the extra `foxglove`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import importlib.util
 import json

@@ -1,7 +1,5 @@
 """Options of connections to running robots."""
 
-from __future__ import annotations
-
 import os
 
 from maplab_py.errors import FlagError

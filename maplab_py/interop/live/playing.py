@@ -1,7 +1,5 @@
 """A recording published as topics, at its own pace or another."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Poses, transforms and landmarks of a running odometry as topics."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

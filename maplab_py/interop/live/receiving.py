@@ -4,8 +4,6 @@ One thread receives and does nothing else; another takes. IMU samples are never 
 images are, the oldest first, when they have waited too long.
 """
 
-from __future__ import annotations
-
 import collections
 import dataclasses
 import struct

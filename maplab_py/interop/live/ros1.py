@@ -3,8 +3,6 @@
 Sources: wiki.ros.org, "ROS/Master_API", "ROS/Slave_API", "ROS/TCPROS".
 """
 
-from __future__ import annotations
-
 import contextlib
 import http.client
 import os

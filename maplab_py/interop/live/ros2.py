@@ -5,8 +5,6 @@ documentation, "About internal ROS 2 interfaces" and "About Quality of Service s
 "Configuration guide".
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import os

@@ -1,7 +1,5 @@
 """A recording that is still going on: the topics of a running robot."""
 
-from __future__ import annotations
-
 import collections
 import dataclasses
 import math

@@ -1,7 +1,5 @@
 """Common interface of the ways to topics."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import struct

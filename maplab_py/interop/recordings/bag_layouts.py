@@ -4,8 +4,6 @@ Sources: ROS 1, wiki "Connection Header" and genmsg (little endian, unaligned); 
 section 7.4.1 (plain CDR, numbers aligned to their size behind an encapsulation of four bytes).
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

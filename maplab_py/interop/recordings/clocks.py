@@ -1,7 +1,5 @@
 """Stamps that do not increase: repeated, late and wild ones are dropped, restarts of a clock begin parts."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

@@ -1,7 +1,5 @@
 """Images as they are recorded: files, compressed messages, raw messages; decoded when asked for."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 from collections.abc import Callable, Iterable

@@ -1,7 +1,5 @@
 """A mission of a map as a recording: its keypoints as if just tracked, its IMU samples as measured."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

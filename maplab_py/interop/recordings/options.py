@@ -1,7 +1,5 @@
 """Options of readers and of the stream of events, with the names of rovioli's flags."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from maplab_py.errors import FlagError

@@ -1,7 +1,5 @@
 """IMUs whose gyroscope and accelerometer are topics of their own, as RealSense cameras publish them."""
 
-from __future__ import annotations
-
 import collections
 
 Sample = tuple[float, ...]

@@ -1,7 +1,5 @@
 """Finding the reader and the calibration of a recording."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from maplab_py.errors import UserError

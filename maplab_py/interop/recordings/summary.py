@@ -1,7 +1,5 @@
 """Content of a recording: rates, gaps, durations, and what a reader leaves out."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 

@@ -4,8 +4,6 @@ A depth map of the format is a 16-bit image of the size of the camera's images: 
 optical axis in millimetres at the pixels of the camera's own, distorted image; 0 = unknown.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Images of recordings as resources of frames, and resources as an EuRoC folder."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

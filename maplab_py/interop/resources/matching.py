@@ -1,7 +1,5 @@
 """Files with time stamps, matched to the frames of a mission."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

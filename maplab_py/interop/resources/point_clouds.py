@@ -1,7 +1,5 @@
 """Point clouds of other programs as resources of a sensor at a time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path

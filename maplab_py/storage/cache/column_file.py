@@ -8,8 +8,6 @@ has written to is told from one that has not been touched.
 Descriptors, which are the larger half of a map, are not read to be checked: their CRC-32 is that of samples.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math

@@ -4,8 +4,6 @@ The name of an entry is the hash of the checksums of all files of a map, so a ch
 entry and a copy of a map has the same one. An entry that cannot be used is written again, never trusted.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import functools

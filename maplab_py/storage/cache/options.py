@@ -1,7 +1,5 @@
 """Options of the cache of loaded maps."""
 
-from __future__ import annotations
-
 from maplab_py.options import Options, option
 
 

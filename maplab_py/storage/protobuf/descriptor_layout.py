@@ -8,8 +8,6 @@
   feature type of each block.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from typing import Literal

@@ -1,7 +1,5 @@
 """Convert the frames, keypoints, landmarks and observations of vertices to tables."""
 
-from __future__ import annotations
-
 import dataclasses
 from itertools import chain
 from typing import Any

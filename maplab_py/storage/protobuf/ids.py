@@ -4,8 +4,6 @@ The bytes of the words of an id are stored in the order of its hexadecimal digit
 therefore byte-swapped between file and memory.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from itertools import chain, islice
 from operator import attrgetter

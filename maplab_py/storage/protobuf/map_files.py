@@ -1,7 +1,5 @@
 """List, unpack and parse the files of a map folder, with bounds on their size."""
 
-from __future__ import annotations
-
 import stat
 import zlib
 from enum import IntEnum

@@ -3,8 +3,6 @@
 `where` is the field and `name` gives file, kind and id of an entry, for the message of an error.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar

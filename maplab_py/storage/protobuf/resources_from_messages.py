@@ -1,7 +1,5 @@
 """Convert messages to the table of resources of frames, missions and sensors."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

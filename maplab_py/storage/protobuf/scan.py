@@ -5,8 +5,6 @@ kilobyte as objects. Two estimates, both upper bounds: one that costs a pass ove
 one that follows the fields.
 """
 
-from __future__ import annotations
-
 import functools
 from pathlib import Path
 from typing import Any

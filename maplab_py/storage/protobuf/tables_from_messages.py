@@ -1,7 +1,5 @@
 """Convert messages to tables: base frames, missions, vertices and edges."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The files of a VI-map: which entities are in which, and their content as C++ maplab writes it."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import Any

@@ -4,8 +4,6 @@ The messages of a file take several times the memory of its tables, so they are 
 file is read.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Convert the columns of a file of vertices to a message, as C++ maplab writes it."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The resource files of a map on disk: which are missing, which nothing refers to, equal folders."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 from collections.abc import Iterable, Iterator

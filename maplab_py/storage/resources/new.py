@@ -1,7 +1,5 @@
 """New resources of a map: staged in a temporary folder until the map is saved."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import hashlib

@@ -1,7 +1,5 @@
 """The resource types of the format: number, folder name, file suffix."""
 
-from __future__ import annotations
-
 import dataclasses
 
 from maplab_py.errors import MapError, UserError

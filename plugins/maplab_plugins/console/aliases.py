@@ -1,7 +1,5 @@
 """Aliases and lasting flags."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterable
 

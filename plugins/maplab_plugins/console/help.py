@@ -1,7 +1,5 @@
 """Help: commands, plugins, and the schemas of reports."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re

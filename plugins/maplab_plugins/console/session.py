@@ -1,7 +1,5 @@
 """Commands about the session: timing, repetition, transcript, sheep."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from pathlib import Path

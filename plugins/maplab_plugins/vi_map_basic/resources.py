@@ -1,7 +1,5 @@
 """Resource folders of the selected map: where images, depth maps and other files are stored."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Commands that show image resources: beside the playing map, and for the vertex that is clicked."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

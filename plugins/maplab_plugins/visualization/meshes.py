@@ -1,7 +1,5 @@
 """The commands that show a mesh, of the map's grids or of a file, and a slice of a distance field."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from maplab_plugins.visualization.following import ViewerOptions, ViewReport, show

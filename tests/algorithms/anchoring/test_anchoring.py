@@ -1,7 +1,5 @@
 """Base frames of missions: from pairs, over trees of missions, against rooms that look alike."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Cells of a map: every vertex is in one, cells are valid maps, and joined again they are the map."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

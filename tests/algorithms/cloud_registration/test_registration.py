@@ -1,7 +1,5 @@
 """Pairs of simulated clouds against their true poses, and loop closures between sessions by clouds."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Iterator

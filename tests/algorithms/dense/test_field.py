@@ -1,7 +1,5 @@
 """Distance fields and distances from triangles against closed form, scipy's transform and brute force."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numba

@@ -1,7 +1,5 @@
 """Fusion of true depth against the true surfaces, and grids of planes and spheres against closed form."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

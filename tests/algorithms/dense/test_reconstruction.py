@@ -1,7 +1,5 @@
 """Rectification of every camera model, and depth of rendered stereo images against the truth."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

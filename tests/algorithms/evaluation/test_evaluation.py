@@ -1,7 +1,5 @@
 """APE and RPE against evo's numbers, vertices against ground truth, and two maps compared."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Hints on quaternion orders and clocks of trajectories that other people wrote."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Features of rendered images: where they are, what they replace, and what they become."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Loop closure by SIFT against BRISK, both of the same rendered images of two sessions."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Choice of keyframes, and inertial edges that predict the same before and after they are merged."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 

@@ -1,7 +1,5 @@
 """Landmarks: made, initialised, and judged by the geometry of their rays."""
 
-from __future__ import annotations
-
 import warnings
 
 import numpy as np

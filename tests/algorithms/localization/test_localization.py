@@ -1,7 +1,5 @@
 """Localisation in simulated sessions against the truth; guided matching against brute force."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from functools import cache

@@ -1,7 +1,5 @@
 """Vertices removed, edges merged, and missions at rest that are tied."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

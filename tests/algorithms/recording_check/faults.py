@@ -1,7 +1,5 @@
 """Recordings with one planted fault each, over any sound recording."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterator
 

@@ -1,7 +1,5 @@
 """Each check alone on made signals, the doctor on planted faults, and recordings that are mended."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Maps of a device that walks the same loop twice, drifts, and finds closures, some of them false."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -4,8 +4,6 @@ SE-Sync (Rosen et al., IJRR 2019, table 1) measures rotations by chords, so its 
 what the noise of a data set makes of that.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

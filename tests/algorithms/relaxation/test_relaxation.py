@@ -1,7 +1,5 @@
 """Relaxation of simulated loops with and without false closures, and the pose graph of a map."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numba

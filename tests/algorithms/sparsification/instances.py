@@ -1,7 +1,5 @@
 """Coverage problems of any size: keyframes in a row, landmarks seen from a stretch of it."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.algorithms.sparsification.selection import CoverageProblem, level_values

@@ -1,7 +1,5 @@
 """Landmarks that are kept: problem of a map, choices against brute force and bound, the command's work."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 

@@ -5,8 +5,6 @@ noise and 0.05 on the vector part of a unit quaternion, landmarks 0.2 m in the f
 that stores them; the result is compared with the map that was optimised undisturbed.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from functools import cache
 

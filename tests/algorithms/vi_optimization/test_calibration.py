@@ -1,7 +1,5 @@
 """Calibrations that are freed: all that are named, or those that the residuals contradict."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

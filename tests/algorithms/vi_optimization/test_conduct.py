@@ -1,7 +1,5 @@
 """Conduct: cancelling, limits, hopeless input, threads, and the choice of the linear solver."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 

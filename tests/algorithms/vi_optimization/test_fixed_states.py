@@ -1,7 +1,5 @@
 """States that stay: by flags, and as many directions as no measurement shows."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import cache
 

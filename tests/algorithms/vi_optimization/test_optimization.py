@@ -1,7 +1,5 @@
 """optvi against truth: accuracy, thinned observations, and parts of a map."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Gate of observations, weights by chi-square, thresholds between missions."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

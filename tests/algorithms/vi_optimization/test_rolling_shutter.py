@@ -1,7 +1,5 @@
 """Rolling shutters: known line delays, estimated ones, and the fast kernels that need none."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Perfect measurements bring disturbed maps back to the truth, to 1e-8 m and 1e-8 rad."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

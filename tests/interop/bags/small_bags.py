@@ -1,7 +1,5 @@
 """A small map with images, depth maps and clouds, and bags that are read with rosbags."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any

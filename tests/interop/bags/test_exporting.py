@@ -1,7 +1,5 @@
 """Bags of a map: missions, poses and the whole scene, read back with rosbags and by rovioli."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from pathlib import Path
 

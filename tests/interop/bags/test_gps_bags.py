@@ -1,7 +1,5 @@
 """Fixes of satellite receivers in bags of ROS 1 and ROS 2, and bags without any."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

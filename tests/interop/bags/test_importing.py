@@ -1,7 +1,5 @@
 """Resources of bags; bags that are damaged or hold messages of unknown types."""
 
-from __future__ import annotations
-
 import shutil
 import sqlite3
 from collections.abc import Callable

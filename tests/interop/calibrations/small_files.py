@@ -1,7 +1,5 @@
 """Calibration files of other programs, with poses and noise that tests know; fuzzing starts from them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Calibrations in which something is missing, misspelt, contradicts, or stands in several files."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Calibrations of other programs, and of single cameras and devices."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

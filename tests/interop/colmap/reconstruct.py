@@ -3,8 +3,6 @@
 Writes `database.db` and the folder `0` with the first model.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

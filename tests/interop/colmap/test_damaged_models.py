@@ -1,7 +1,5 @@
 """Models that are cut, damaged, or do not fit: one line, and no map."""
 
-from __future__ import annotations
-
 import dataclasses
 import shutil
 import sqlite3

@@ -1,7 +1,5 @@
 """A model that pycolmap makes of four of five recorded images: imported, aligned, and localised in."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import subprocess

@@ -1,7 +1,5 @@
 """Map -> COLMAP model -> map, the model as pycolmap sees it, cameras, times of images."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import shutil

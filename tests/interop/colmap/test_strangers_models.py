@@ -1,7 +1,5 @@
 """Models as other people have them: names with blanks, changed poses, other databases, many models."""
 
-from __future__ import annotations
-
 import dataclasses
 import shutil
 import sqlite3

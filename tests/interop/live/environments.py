@@ -4,8 +4,6 @@ ROS 2 Jazzy and Kilted as wheels of PyPI (they change how their Python starts, s
 tests), foxglove-sdk, and ROS 1 of Debian. They lie in the folder that MAPLAB_TEST_NODES names.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

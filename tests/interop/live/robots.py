@@ -1,7 +1,5 @@
 """Real robots beside rovioli: a node plays a recording, rovioli maps it, and both say what they saw."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os

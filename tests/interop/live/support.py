@@ -1,7 +1,5 @@
 """A connection without a network, a small device, and a small master of ROS 1."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import threading

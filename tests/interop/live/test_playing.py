@@ -1,7 +1,5 @@
 """Recordings that are played, recorded again and listed; what is published of an estimate."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

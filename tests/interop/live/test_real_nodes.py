@@ -1,7 +1,5 @@
 """The odometry on topics of real nodes of ROS 2 Jazzy and Kilted, ROS 1 and Foxglove, as on the folder."""
 
-from __future__ import annotations
-
 import dataclasses
 import subprocess
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """What a live recording yields and leaves out; sets of images, and samples of two IMU topics."""
 
-from __future__ import annotations
-
 import struct
 import threading
 import time

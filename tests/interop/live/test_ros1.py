@@ -1,7 +1,5 @@
 """Topics of ROS 1: headers, publishers that go and come, and a master that does."""
 
-from __future__ import annotations
-
 import socket
 import struct
 

@@ -1,7 +1,5 @@
 """Topics of ROS 2 between two programs; the counterparts of test_real_nodes are ROS itself."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

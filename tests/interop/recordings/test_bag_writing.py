@@ -1,7 +1,5 @@
 """Bags that are written: messages equal those of rosbags, bags read back to the last bit."""
 
-from __future__ import annotations
-
 import os
 import sqlite3
 import subprocess

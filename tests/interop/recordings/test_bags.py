@@ -1,7 +1,5 @@
 """ROS 1 and ROS 2 bags: written and read again, equal to folders, and damaged ones."""
 
-from __future__ import annotations
-
 import dataclasses
 import sys
 import tracemalloc

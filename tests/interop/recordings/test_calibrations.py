@@ -1,7 +1,5 @@
 """Calibrations: kalibr's files of the real data sets, what we export, sensors.yaml, and wrong files."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Stamps that repeat, come late or start again, and clocks of IMU and cameras that differ."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """EuRoC and TUM-VI folders: written and read again, real ones, and damaged ones."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Bags of other recorders: topics, spellings, metadata, compression; each failure with its remedy."""
 
-from __future__ import annotations
-
 import dataclasses
 import shutil
 import sqlite3

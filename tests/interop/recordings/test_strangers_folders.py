@@ -1,7 +1,5 @@
 """Tables of images and IMU samples as other programs and people leave them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Cameras synchronised, missions of maps replayed, values of 10 to 14 bits."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any

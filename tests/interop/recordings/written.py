@@ -1,7 +1,5 @@
 """A small recording, written as an EuRoC folder and as bags."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Images, depth maps and clouds of files become resources; bad files change nothing."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """What a robot sends, in its order and at its pace; for nodes that have numpy alone."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -3,8 +3,6 @@
 Runs in an environment of its own, not in that of the tests.
 """
 
-from __future__ import annotations
-
 import struct
 from typing import Any
 

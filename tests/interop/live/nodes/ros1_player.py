@@ -3,8 +3,6 @@
 Runs with Debian's Python, not in the environment of the tests.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import events

@@ -3,8 +3,6 @@
 Runs in an environment of ROS 2, not in that of the tests.
 """
 
-from __future__ import annotations
-
 import array
 import threading
 from typing import Any

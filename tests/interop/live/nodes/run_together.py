@@ -1,7 +1,5 @@
 """Runs the programs of a folder at the same time where only the loopback is, and measures rovioli."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
