@@ -15,27 +15,14 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.algorithms.self_calibration.changes import (
-    Contradiction,
-    Evidence,
-    evidence_of,
-    strongest_contradiction,
-)
+from maplab_py.algorithms.self_calibration import changes
 from maplab_py.algorithms.self_calibration.estimation.parameters import Parameters
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
 from maplab_py.algorithms.self_calibration.pruning import estimate_segment
-from maplab_py.algorithms.self_calibration.segments.splitting import (
-    extract_submap,
-    split_into_segments,
-)
+from maplab_py.algorithms.self_calibration.segments import splitting
 from maplab_py.online_calibration.options import WantedSigmas
 from maplab_py.online_calibration.suggestions import wanted_sigma
-from maplab_py.simulation.scenario import (
-    CalibrationOptions,
-    MotionOptions,
-    Scenario,
-    SessionOptions,
-)
+from maplab_py.simulation import scenario as sim
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate
 from maplab_py.vimap import VIMap
@@ -47,14 +34,14 @@ _FIRST_AFTER = 7
 _ALLOWED_S = 30.0
 
 
-def scenario_of(seed: int, change: str) -> Scenario:
+def scenario_of(seed: int, change: str) -> sim.Scenario:
     """Return a session with the change from its beginning."""
     phases = (
-        MotionOptions(kind="room_scan", duration_s=30.0, turns=0.5, height_m=1.4),
-        MotionOptions(kind="figure_8", duration_s=30.0, turns=0.5, height_m=1.4),
+        sim.MotionOptions(kind="room_scan", duration_s=30.0, turns=0.5, height_m=1.4),
+        sim.MotionOptions(kind="figure_8", duration_s=30.0, turns=0.5, height_m=1.4),
     )
     w = WantedSigmas()
-    calibration = CalibrationOptions(
+    calibration = sim.CalibrationOptions(
         focal_sigma_px=0.5 * w.focal_relative * 255.0,
         centre_sigma_px=0.5 * w.centre_px,
         distortion_sigma=0.5 * w.distortion,
@@ -76,7 +63,7 @@ def scenario_of(seed: int, change: str) -> Scenario:
     elif change == "gyroscope scale":
         imu = dataclasses.replace(imu, gyro_scale=(1.01, 1.01, 1.01))
     measurement = dataclasses.replace(plain.measurement, max_keypoints=100)
-    sessions = (SessionOptions(phases=phases),)
+    sessions = (sim.SessionOptions(phases=phases),)
     return dataclasses.replace(
         plain, calibration=calibration, cameras=(camera,), imu=imu, sessions=sessions,
         measurement=measurement,
@@ -88,7 +75,7 @@ class Watch:
 
     def __init__(self) -> None:
         """Start without segments."""
-        self.evidence: list[Evidence] = []
+        self.evidence: list[changes.Evidence] = []
         self._parameters, self._tolerance = Parameters(()), np.zeros(0)
 
     def copy(self) -> Watch:
@@ -98,25 +85,25 @@ class Watch:
         other._parameters, other._tolerance = self._parameters, self._tolerance
         return other
 
-    def add(self, segment: VIMap) -> Contradiction | None:
+    def add(self, segment: VIMap) -> changes.Contradiction | None:
         """Take a segment; return the strongest contradiction."""
         estimate, time_ns = estimate_segment(segment, OPTIONS), segment.vertices.timestamp_ns
         if not len(self._tolerance):
             self._parameters = estimate.parameters
             self._tolerance = wanted_sigma(segment, OPTIONS, WantedSigmas())
         if len(estimate.parameters) == len(self._parameters):
-            self.evidence.append(evidence_of(estimate, int(time_ns[0]), int(time_ns[-1])))
-        return strongest_contradiction(self.evidence, self._parameters, self._tolerance)
+            self.evidence.append(changes.evidence_of(estimate, int(time_ns[0]), int(time_ns[-1])))
+        return changes.strongest_contradiction(self.evidence, self._parameters, self._tolerance)
 
 
 def measure(seed: int) -> dict[str, tuple[float, str]]:
     """Return for every change after how many seconds what was detected; nan = nothing."""
     plain, result = simulate(scenario_of(seed, "none")).maps[0], {}
-    rows = split_into_segments(plain, None, OPTIONS.segment_keyframes)
+    rows = splitting.split_into_segments(plain, None, OPTIONS.segment_keyframes)
     before, largest = Watch(), 0.0
     early = ""
     for of_segment in rows[:_FIRST_AFTER]:
-        said = before.add(extract_submap(plain, of_segment))
+        said = before.add(splitting.extract_submap(plain, of_segment))
         if said is not None:
             largest = max(largest, said.sigmas)
             early = said.family if said.is_significant else early
@@ -127,7 +114,7 @@ def measure(seed: int) -> dict[str, tuple[float, str]]:
             vi_map = simulate(scenario_of(seed, change)).maps[0].replace(sensors=plain.sensors)
         watch, after_s, name = before.copy(), float("nan"), early and f"before: {early}"
         for of_segment in rows[_FIRST_AFTER:]:
-            said = watch.add(extract_submap(vi_map, of_segment))
+            said = watch.add(splitting.extract_submap(vi_map, of_segment))
             if said is not None and change == "none":
                 largest = max(largest, said.sigmas)
             if said is not None and said.is_significant:

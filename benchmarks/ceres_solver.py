@@ -4,21 +4,14 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.problems import (
-    CENTRE_PX,
-    F64,
-    FOCAL_PX,
-    IMAGE_PX,
-    NUM_KNOWN_POSES,
-    VisualProblem,
-)
+from benchmarks import problems
 from benchmarks.solution import Effort, Solution, StoppingRule, effort
 
 NUM_THREADS = 2
 _CAMERA = 1
 
 
-def solve_visual(problem: VisualProblem, rule: StoppingRule) -> tuple[Solution, Effort]:
+def solve_visual(problem: problems.VisualProblem, rule: StoppingRule) -> tuple[Solution, Effort]:
     """Minimise the reprojection errors by Schur elimination, sparse as COLMAP does or iterative.
 
     Filling pycolmap's reconstruction does not count as effort: it is the form of the input.
@@ -30,7 +23,7 @@ def solve_visual(problem: VisualProblem, rule: StoppingRule) -> tuple[Solution, 
     for keyframe in range(len(problem.T_G_I)):
         config.add_image(keyframe + 1)
     config.set_constant_cam_intrinsics(_CAMERA)
-    for keyframe in range(NUM_KNOWN_POSES):
+    for keyframe in range(problems.NUM_KNOWN_POSES):
         config.set_constant_rig_from_world_pose(keyframe + 1)
     options = _options(rule)
     with effort() as spent:
@@ -66,13 +59,13 @@ def _options(rule: StoppingRule) -> Any:
     return options
 
 
-def _reconstruction(problem: VisualProblem) -> Any:
+def _reconstruction(problem: problems.VisualProblem) -> Any:
     """Fill pycolmap's own data structure, element by element as its interface asks for."""
     import pycolmap
 
     result = pycolmap.Reconstruction()
-    width, height = IMAGE_PX.astype(int)
-    parameters = [FOCAL_PX, FOCAL_PX, *CENTRE_PX]
+    width, height = problems.IMAGE_PX.astype(int)
+    parameters = [problems.FOCAL_PX, problems.FOCAL_PX, *problems.CENTRE_PX]
     camera = pycolmap.Camera(
         camera_id=_CAMERA, model="PINHOLE", width=width, height=height, params=parameters
     )
@@ -98,7 +91,9 @@ def _reconstruction(problem: VisualProblem) -> Any:
     return result
 
 
-def _states(reconstruction: Any, problem: VisualProblem) -> tuple[F64, F64]:
+def _states(
+    reconstruction: Any, problem: problems.VisualProblem
+) -> tuple[problems.F64, problems.F64]:
     T_G_I = np.empty_like(problem.T_G_I)
     for keyframe in range(len(T_G_I)):
         T_G_C = reconstruction.image(keyframe + 1).cam_from_world().inverse()

@@ -6,21 +6,16 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.problems import (
-    CENTRE_PX,
-    F64,
-    FOCAL_PX,
-    GRAVITY_MPS2,
-    NUM_KNOWN_POSES,
-    InertialProblem,
-)
+from benchmarks import problems
 from benchmarks.solution import Effort, Solution, StoppingRule, effort
 
 _KNOWN_POSE_SIGMA = 1e-6
 """GTSAM's priors on the known poses: so tight that they add nothing to the cost [m, rad]."""
 
 
-def solve_inertial(problem: InertialProblem, rule: StoppingRule) -> tuple[Solution, Effort]:
+def solve_inertial(
+    problem: problems.InertialProblem, rule: StoppingRule
+) -> tuple[Solution, Effort]:
     """Minimise reprojection and inertial errors.
 
     Preintegration and filling the factor graph do not count as effort: through Python they take
@@ -45,23 +40,23 @@ def solve_inertial(problem: InertialProblem, rule: StoppingRule) -> tuple[Soluti
     return _solution(optimizer.values(), problem, optimizer.error(), iterations), spent
 
 
-def cost_of(problem: InertialProblem, solution: Solution) -> float:
+def cost_of(problem: problems.InertialProblem, solution: Solution) -> float:
     """Return GTSAM's cost of states that any solver found."""
     return float(_graph(problem).error(_values(solution)))
 
 
-def _graph(problem: InertialProblem) -> Any:
+def _graph(problem: problems.InertialProblem) -> Any:
     import gtsam
     from gtsam.symbol_shorthand import B, L, V, X
 
     graph, visual, noise = gtsam.NonlinearFactorGraph(), problem.visual, problem.noise
-    calibration = gtsam.Cal3_S2(FOCAL_PX, FOCAL_PX, 0.0, *CENTRE_PX)
+    calibration = gtsam.Cal3_S2(problems.FOCAL_PX, problems.FOCAL_PX, 0.0, *problems.CENTRE_PX)
     pixel = gtsam.noiseModel.Isotropic.Sigma(2, 1.0)
     observed = zip(visual.uv_px, visual.keyframe.tolist(), visual.landmark.tolist(), strict=True)
     for uv, k, landmark in observed:
         graph.add(gtsam.GenericProjectionFactorCal3_S2(uv, pixel, X(k), L(landmark), calibration))
     known = gtsam.noiseModel.Isotropic.Sigma(6, _KNOWN_POSE_SIGMA)
-    for k in range(NUM_KNOWN_POSES):
+    for k in range(problems.NUM_KNOWN_POSES):
         graph.add(gtsam.PriorFactorPose3(X(k), _pose(visual.initial_T_G_I[k]), known))
     duration_s = (problem.timestamp_ns[:, -1] - problem.timestamp_ns[:, 0]) * 1e-9
     for k, measured in enumerate(_preintegrated(problem)):
@@ -73,7 +68,7 @@ def _graph(problem: InertialProblem) -> Any:
     return graph
 
 
-def _preintegrated(problem: InertialProblem) -> Iterator[Any]:
+def _preintegrated(problem: problems.InertialProblem) -> Iterator[Any]:
     """Preintegrate with the mean angular velocity and force of each interval.
 
     GTSAM takes values that are constant during an interval. It is given those that change the
@@ -84,7 +79,7 @@ def _preintegrated(problem: InertialProblem) -> Iterator[Any]:
     """
     import gtsam
 
-    parameters = gtsam.PreintegrationParams.MakeSharedU(GRAVITY_MPS2)
+    parameters = gtsam.PreintegrationParams.MakeSharedU(problems.GRAVITY_MPS2)
     parameters.setGyroscopeCovariance(np.eye(3) * problem.noise.gyro**2)
     parameters.setAccelerometerCovariance(np.eye(3) * problem.noise.accel**2)
     parameters.setIntegrationCovariance(np.zeros((3, 3)))
@@ -103,7 +98,7 @@ def _preintegrated(problem: InertialProblem) -> Iterator[Any]:
         yield measured
 
 
-def _for_the_position(turn: Rotation, lacking: F64) -> F64:
+def _for_the_position(turn: Rotation, lacking: problems.F64) -> problems.F64:
     """Return forces (E, N, 3) that add dt^2 / 2 of what is lacking in each interval (E, N, 3)."""
     edges, intervals, _ = lacking.shape
     turns = turn.as_matrix().reshape(edges, intervals, 3, 3)
@@ -117,7 +112,7 @@ def _for_the_position(turn: Rotation, lacking: F64) -> F64:
     return added
 
 
-def _initial_values(problem: InertialProblem) -> Any:
+def _initial_values(problem: problems.InertialProblem) -> Any:
     visual, count = problem.visual, len(problem.visual.T_G_I)
     biases = (
         np.tile(b, (count, 1)) for b in (problem.initial_gyro_bias, problem.initial_accel_bias)
@@ -143,14 +138,16 @@ def _values(states: Solution) -> Any:
     return values
 
 
-def _pose(T_G_I: F64) -> Any:
+def _pose(T_G_I: problems.F64) -> Any:
     import gtsam
 
     x, y, z, w = T_G_I[:4]
     return gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), T_G_I[4:])
 
 
-def _solution(values: Any, problem: InertialProblem, cost: float, iterations: int) -> Solution:
+def _solution(
+    values: Any, problem: problems.InertialProblem, cost: float, iterations: int
+) -> Solution:
     from gtsam.symbol_shorthand import B, L, V, X
 
     count, landmarks = len(problem.visual.T_G_I), len(problem.visual.p_G)

@@ -12,16 +12,8 @@ import argparse
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks import problems
 from benchmarks.maplab_solver import inertial_parts
-from benchmarks.problems import (
-    F64,
-    I64,
-    NUM_KNOWN_POSES,
-    InertialProblem,
-    disturbed_problem,
-    project,
-    with_inertial_samples,
-)
 from benchmarks.solution import effort
 from maplab_py.estimation.linear.supernodal_solver import SupernodalCholesky
 from maplab_py.estimation.problem import gauge
@@ -40,7 +32,7 @@ _DETECTED = 0.6
 _IMAGE_PX = np.array([752.0, 480.0])
 
 
-def make_loop(sessions: int, keyframes: int, seed: int = 0) -> InertialProblem:
+def make_loop(sessions: int, keyframes: int, seed: int = 0) -> problems.InertialProblem:
     """Make the problem of some sessions with so many keyframes each; the same every time."""
     rng = np.random.default_rng(seed)
     along_m = np.arange(keyframes) * SPACING_M
@@ -51,11 +43,11 @@ def make_loop(sessions: int, keyframes: int, seed: int = 0) -> InertialProblem:
     )
     place_m = np.concatenate([along_m + begin for begin in begin_m]) % LOOP_M
     p_G, keyframe, landmark = _sightings(T_G_I, place_m, rng)
-    visual = disturbed_problem(T_G_I, p_G, keyframe, landmark, rng)
-    return with_inertial_samples(visual, keyframes, rng)
+    visual = problems.disturbed_problem(T_G_I, p_G, keyframe, landmark, rng)
+    return problems.with_inertial_samples(visual, keyframes, rng)
 
 
-def _walk(along_m: F64, lane_m: float) -> F64:
+def _walk(along_m: problems.F64, lane_m: float) -> problems.F64:
     """Return poses (V, 7) at distances along the loop: z looks outwards, y down."""
     angle = 2.0 * np.pi * along_m / LOOP_M
     radius = LOOP_M / (2.0 * np.pi) + lane_m + 0.1 * np.sin(0.4 * along_m)
@@ -69,7 +61,9 @@ def _walk(along_m: F64, lane_m: float) -> F64:
     return np.concatenate([Rotation.from_matrix(R_G_C).as_quat(), p], axis=1)
 
 
-def _sightings(T_G_I: F64, place_m: F64, rng: np.random.Generator) -> tuple[F64, I64, I64]:
+def _sightings(
+    T_G_I: problems.F64, place_m: problems.F64, rng: np.random.Generator
+) -> tuple[problems.F64, problems.I64, problems.I64]:
     """Return landmarks (L, 3), and keyframe and landmark of each observation, by landmark."""
     count = int(_LANDMARKS_PER_M * LOOP_M)
     at_m = np.sort(rng.uniform(0.0, LOOP_M, count))
@@ -81,7 +75,7 @@ def _sightings(T_G_I: F64, place_m: F64, rng: np.random.Generator) -> tuple[F64,
     for row in range(len(T_G_I)):
         off_m = np.abs((at_m - place_m[row] + 0.5 * LOOP_M) % LOOP_M - 0.5 * LOOP_M)
         near = np.flatnonzero((off_m < _REACH_M) & (rng.random(count) < _DETECTED))
-        uv, depth = project(np.broadcast_to(T_G_I[row], (len(near), 7)), p_G[near])
+        uv, depth = problems.project(np.broadcast_to(T_G_I[row], (len(near), 7)), p_G[near])
         seen = near[(depth > 0.5) & (uv > 0.0).all(axis=1) & (uv < _IMAGE_PX).all(axis=1)]
         keyframes.append(np.full(len(seen), row))
         landmarks.append(seen)
@@ -111,7 +105,7 @@ def main() -> None:
         print(_solve(problem, arguments.forcing, arguments.submaps, arguments.iterations))
 
 
-def _solve(made: InertialProblem, forcing: float, submaps: int, iterations: int) -> str:
+def _solve(made: problems.InertialProblem, forcing: float, submaps: int, iterations: int) -> str:
     """Optimise and say what it took."""
     states, visual, factors = inertial_parts(made)
     with effort() as spent:
@@ -123,7 +117,7 @@ def _solve(made: InertialProblem, forcing: float, submaps: int, iterations: int)
             )
         else:
             problem = Problem(states, visual, factors)
-        gauge.fix_pose(problem, np.arange(NUM_KNOWN_POSES))
+        gauge.fix_pose(problem, np.arange(problems.NUM_KNOWN_POSES))
         options = SolverOptions(num_iterations=iterations, function_tolerance=0.0)
         _, summary = optimize_states(problem, states, options, SILENT)
     factor = ""

@@ -15,12 +15,7 @@ import numpy as np
 
 from maplab_py.algorithms.anchoring.anchoring import anchor_missions
 from maplab_py.algorithms.loop_closure.workflow import close_loops
-from maplab_py.simulation.scenario import (
-    MeasurementOptions,
-    Scenario,
-    SessionOptions,
-    WorldOptions,
-)
+from maplab_py.simulation import scenario as sim
 from maplab_py.simulation.simulate import simulate
 from maplab_py.vimap import VIMap
 from tests.algorithms.loop_closure.against_truth import joined
@@ -45,7 +40,7 @@ class MissionsFigures:
 def missions_of_one_room(count: int, *, seed: int = 1) -> VIMap:
     """Return missions of one room in one map, the first of known base frame."""
     sessions = tuple(
-        SessionOptions(
+        sim.SessionOptions(
             kind="room_scan",
             duration_s=DURATION_S,
             turns=0.6,
@@ -55,10 +50,10 @@ def missions_of_one_room(count: int, *, seed: int = 1) -> VIMap:
         )
         for number in range(count)
     )
-    scenario = Scenario(
+    scenario = sim.Scenario(
         name="many_missions",
-        world=WorldOptions(room_size_m=(7.0, 6.0, 3.0), landmarks_per_room=1500),
-        measurement=MeasurementOptions(frame_rate_hz=RATE_HZ, max_keypoints=KEYPOINTS),
+        world=sim.WorldOptions(room_size_m=(7.0, 6.0, 3.0), landmarks_per_room=1500),
+        measurement=sim.MeasurementOptions(frame_rate_hz=RATE_HZ, max_keypoints=KEYPOINTS),
         sessions=sessions,
     ).with_seed(seed)
     vi_map = joined(simulate(scenario))

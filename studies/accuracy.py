@@ -11,11 +11,7 @@ import numpy as np
 from maplab_py.algorithms.self_calibration.calibration import Calibration, calibrate
 from maplab_py.algorithms.self_calibration.device import transfer_calibration
 from maplab_py.algorithms.self_calibration.reports import SelfCalibrationReport
-from maplab_py.algorithms.self_calibration.segments.selection import (
-    Evaluation,
-    collect,
-    evaluate,
-)
+from maplab_py.algorithms.self_calibration.segments import selection
 from maplab_py.algorithms.self_calibration.segments.splitting import extract_submap
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
@@ -60,7 +56,7 @@ class DataSet:
     nominal_error: F64  # (k,) of the nominal calibration
     truth: ParameterBlocks
     true_sensors: SensorSet
-    evaluation: Evaluation
+    evaluation: selection.Evaluation
     selection_s: float  # processor time per segment
 
     @classmethod
@@ -70,7 +66,7 @@ class DataSet:
         vi_map, true, nominal = data.maps[0], true_problem(data), problem_of(data.maps[0])
         truth = true.states.blocks
         began = time.process_time()
-        evaluation = evaluate(vi_map, OPTIONS)
+        evaluation = selection.evaluate(vi_map, OPTIONS)
         return cls(
             number,
             vi_map,
@@ -129,8 +125,8 @@ def _segments(scenario: Scenario, data: DataSet, method: str, per_group: int) ->
         return data.vi_map, len(data.evaluation.segments)
     if method == "two sessions":
         options = dataclasses.replace(OPTIONS, segments_per_group=per_group)
-        database, _ = collect(data_set(scenario, data.number + 1).maps[0], options)
-        database, _ = collect(data.vi_map, options, database)
+        database, _ = selection.collect(data_set(scenario, data.number + 1).maps[0], options)
+        database, _ = selection.collect(data.vi_map, options, database)
         return database.vi_map, len(database)
     if method == "information gain":
         rows = select_by_gain(data.vi_map, OPTIONS, max_segments=FEW)

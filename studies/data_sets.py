@@ -5,10 +5,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from maplab_py.algorithms.self_calibration.estimation.problem import (
-    SegmentProblem,
-    build_segment_problem,
-)
+from maplab_py.algorithms.self_calibration.estimation import problem
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
 from maplab_py.output_files import write_text
 from maplab_py.simulation.scenario import MotionOptions, Scenario, SessionOptions
@@ -82,12 +79,12 @@ def with_noise(
     return dataclasses.replace(scenario, measurement=measurement, imu=imu)
 
 
-def problem_of(vi_map: VIMap) -> SegmentProblem:
+def problem_of(vi_map: VIMap) -> problem.SegmentProblem:
     """Return the problem of a map with all measurements at full weight."""
-    return build_segment_problem(vi_map, OPTIONS, robust=False)
+    return problem.build_segment_problem(vi_map, OPTIONS, robust=False)
 
 
-def true_problem(data: SimulatedData) -> SegmentProblem:
+def true_problem(data: SimulatedData) -> problem.SegmentProblem:
     """Return the problem of a session at its true states and calibration."""
     return problem_of(true_map(data.maps[0], data.truth))
 

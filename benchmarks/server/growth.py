@@ -18,12 +18,7 @@ from benchmarks.server.prepared import prepared
 from maplab_py.server.merging import Merger
 from maplab_py.server.options import IncrementalOptions, MergingOptions, PublishingOptions
 from maplab_py.server.publishing import Publisher, pause_s
-from maplab_py.simulation.scenario import (
-    MeasurementOptions,
-    Scenario,
-    SessionOptions,
-    WorldOptions,
-)
+from maplab_py.simulation import scenario as sim
 from maplab_py.simulation.simulate import SimulatedData, simulate
 from maplab_py.storage.native import save_map
 from maplab_py.vimap import VIMap
@@ -59,7 +54,7 @@ def town(missions: int, blocks: tuple[int, int] = (4, 3)) -> SimulatedData:
         block = (number // 4) % (blocks[0] * blocks[1])
         at = (block % blocks[0], block // blocks[0])
         sessions.append(
-            SessionOptions(
+            sim.SessionOptions(
                 kind="streets",
                 duration_s=15.0,
                 turns=0.35,
@@ -69,16 +64,18 @@ def town(missions: int, blocks: tuple[int, int] = (4, 3)) -> SimulatedData:
                 reverse=(at[0] + at[1]) % 2 == 1,
             )
         )
-    scenario = Scenario(
+    scenario = sim.Scenario(
         name="town",
-        world=WorldOptions(
+        world=sim.WorldOptions(
             layout="city",
             blocks=blocks,
             room_size_m=(18.0, 14.0, 9.0),
             corridor_width_m=6.0,
             landmarks_per_room=4000,
         ),
-        measurement=MeasurementOptions(frame_rate_hz=2.0, max_keypoints=100, max_distance_m=16.0),
+        measurement=sim.MeasurementOptions(
+            frame_rate_hz=2.0, max_keypoints=100, max_distance_m=16.0
+        ),
         sessions=tuple(sessions),
     )
     return simulate(scenario)

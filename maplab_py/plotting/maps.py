@@ -8,14 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.errors import UserError
-from maplab_py.plotting.figure import (
-    label,
-    legend,
-    mission_colour,
-    mission_names,
-    new_figure,
-    thinned,
-)
+from maplab_py.plotting import figure as figures
 from maplab_py.report import counted
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.queries import coobservation_counts, mission_mask, observation_counts
@@ -51,7 +44,7 @@ def trajectories(
     mission, p_G_I = vi_map.vertices.mission, vi_map.T_G_I[:, 4:]
     if not np.isin(mission, chosen).any():
         raise UserError("the map has no vertices to draw")
-    figure = new_figure()
+    figure = figures.new_figure()
     axes = figure.subplots()
     if landmarks:
         _draw_landmarks(axes, vi_map, chosen)
@@ -59,21 +52,23 @@ def trajectories(
         axes.plot(*p_G_truth[:, :2].T, color="black", linewidth=0.8, label="truth")
     for row in chosen:
         x, y = p_G_I[mission == row, :2].T
-        name = mission_names(vi_map)[row]
-        axes.plot(x, y, color=mission_colour(int(row)), linewidth=1.5, label=name)
-        axes.plot(x[:1], y[:1], "o", color=mission_colour(int(row)), markersize=5)
+        name = figures.mission_names(vi_map)[row]
+        axes.plot(x, y, color=figures.mission_colour(int(row)), linewidth=1.5, label=name)
+        axes.plot(x[:1], y[:1], "o", color=figures.mission_colour(int(row)), markersize=5)
     axes.set_aspect("equal", adjustable="datalim")
     unknown = np.count_nonzero(~vi_map.baseframes.is_known[vi_map.missions.baseframe[chosen]])
     note = f"; {unknown} of unknown base frame" if unknown else ""
-    label(axes, "x in G [m]", "y in G [m]", f"{counted(len(chosen), 'mission')} from above{note}")
-    legend(axes, len(chosen))
+    figures.label(
+        axes, "x in G [m]", "y in G [m]", f"{counted(len(chosen), 'mission')} from above{note}"
+    )
+    figures.legend(axes, len(chosen))
     return figure
 
 
 def _draw_landmarks(axes: Axes, vi_map: VIMap, chosen: NDArray[np.int64]) -> None:
     is_good = vi_map.landmarks.quality != LandmarkQuality.BAD
     in_chosen = np.isin(vi_map.vertices.mission[vi_map.landmarks.vertex], chosen)
-    p_G = vi_map.p_G[thinned(np.flatnonzero(is_good & in_chosen))]
+    p_G = vi_map.p_G[figures.thinned(np.flatnonzero(is_good & in_chosen))]
     if not len(p_G):
         return
     low, high = np.percentile(p_G, _PERCENT_OF_LANDMARKS, axis=0)
@@ -93,7 +88,7 @@ def landmark_histograms(vi_map: VIMap, missions: NDArray[np.int64] | None = None
     counts = observation_counts(vi_map)[chosen]
     distance_m = np.linalg.norm(vi_map.landmarks.p_I[chosen], axis=1)
     quality = vi_map.landmarks.quality[chosen]
-    figure = new_figure(11.0, 3.6)
+    figure = figures.new_figure(11.0, 3.6)
     by_count, by_distance, by_quality = figure.subplots(1, 3)
     far_m = max(float(np.percentile(distance_m, 98.0)), 0.1)
     for kind in LandmarkQuality:
@@ -103,9 +98,9 @@ def landmark_histograms(vi_map: VIMap, missions: NDArray[np.int64] | None = None
         by_count.hist(np.minimum(counts[of_kind], most), bins=np.arange(0, most + 2) - 0.5, **style)
         by_distance.hist(distance_m[of_kind], bins=40, range=(0.0, far_m), **style)
         by_quality.bar(kind.name.lower(), np.count_nonzero(of_kind), **style)
-    label(by_count, "observations of a landmark", "landmarks")
-    label(by_distance, "distance from the storing vertex [m]", "landmarks")
-    label(by_quality, "quality", "landmarks", f"{len(counts)} landmarks")
+    figures.label(by_count, "observations of a landmark", "landmarks")
+    figures.label(by_distance, "distance from the storing vertex [m]", "landmarks")
+    figures.label(by_quality, "quality", "landmarks", f"{len(counts)} landmarks")
     return figure
 
 
@@ -118,9 +113,9 @@ def coobservability(vi_map: VIMap) -> Figure:
     if not len(vi_map.missions):
         raise UserError("the map has no missions to draw")
     counts = coobservation_counts(vi_map)
-    names = mission_names(vi_map)
+    names = figures.mission_names(vi_map)
     size_in = 3.5 + 0.45 * min(len(names), 40)
-    figure = new_figure(size_in + 1.0, size_in)
+    figure = figures.new_figure(size_in + 1.0, size_in)
     axes = figure.subplots()
     shade = np.log10(np.maximum(counts, 0.5))
     image = axes.imshow(shade, cmap="viridis", vmin=np.log10(0.5))

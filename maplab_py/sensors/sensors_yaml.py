@@ -15,14 +15,7 @@ from maplab_py.array_types import F64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3
 from maplab_py.input_files import DEFAULT_MAX_BYTES, read_text
-from maplab_py.sensors.camera import (
-    DISTORTION_SIZE,
-    INTRINSICS_SIZE,
-    Camera,
-    CameraRig,
-    Distortion,
-    Projection,
-)
+from maplab_py.sensors import camera as camera_models
 from maplab_py.sensors.imu import Imu, ImuIntrinsics
 from maplab_py.sensors.sensor_set import Extrinsics, OtherSensor, Sensor, SensorSet
 from maplab_py.sensors.yaml_entry import Entry, similar_key
@@ -100,7 +93,7 @@ def sensors_of(content: Any, source: str) -> SensorSet:
     for item in top.items("sensors"):
         sensor = _parse_sensor(item, source)
         ids = [sensor.id]
-        if isinstance(sensor, CameraRig):
+        if isinstance(sensor, camera_models.CameraRig):
             ids += [camera.id for camera in sensor.cameras]
         for sensor_id in ids:
             if sensor_id in taken:
@@ -122,7 +115,7 @@ def note_unread_keys(sensor_set: SensorSet, source: str) -> list[str]:
     """Return one note that names the keys which are kept but not understood, none if there are none."""
     extras: list[Mapping[str, Any]] = [sensor_set.extra]
     for sensor in sensor_set.sensors.values():
-        if isinstance(sensor, CameraRig):
+        if isinstance(sensor, camera_models.CameraRig):
             extras += [sensor.extra, *sensor.camera_extra]
             extras += [camera.extra for camera in sensor.cameras]
         elif isinstance(sensor, Imu):
@@ -159,7 +152,7 @@ def write_sensors(sensor_set: SensorSet) -> str:
 
 def sensor_entry(sensor: Sensor) -> dict[str, Any]:
     """Return the entry of one sensor as plain YAML values."""
-    if isinstance(sensor, CameraRig):
+    if isinstance(sensor, camera_models.CameraRig):
         return _rig_entry(sensor)
     if isinstance(sensor, Imu):
         return _imu_entry(sensor)
@@ -226,7 +219,7 @@ def _upper_triangular(entry: Entry, key: str) -> F64:
     return T
 
 
-def _parse_rig(entry: Entry, sensor_id: str, source: str) -> CameraRig:
+def _parse_rig(entry: Entry, sensor_id: str, source: str) -> camera_models.CameraRig:
     cameras, poses, extras = [], [], []
     for item in entry.items("cameras"):
         mounted = Entry(item, entry.where)
@@ -245,7 +238,7 @@ def _parse_rig(entry: Entry, sensor_id: str, source: str) -> CameraRig:
         extras.append({**rest, **pose[1]})
     if not cameras:
         raise MapError(f"{entry.where}: key 'cameras' is empty")
-    return CameraRig(
+    return camera_models.CameraRig(
         id=sensor_id,
         cameras=tuple(cameras),
         T_B_C=np.array(poses),
@@ -256,17 +249,17 @@ def _parse_rig(entry: Entry, sensor_id: str, source: str) -> CameraRig:
     )
 
 
-def _parse_camera(entry: Entry, camera_id: str) -> Camera:
+def _parse_camera(entry: Entry, camera_id: str) -> camera_models.Camera:
     entry.text("sensor_type")
-    projection = _model(entry, "type", Projection)
+    projection = _model(entry, "type", camera_models.Projection)
     lens = entry.child("distortion")
     lens.where = f"{entry.where}: distortion"
-    distortion = _model(lens, "type", Distortion)
-    size = DISTORTION_SIZE[distortion]
+    distortion = _model(lens, "type", camera_models.Distortion)
+    size = camera_models.DISTORTION_SIZE[distortion]
     parameters = np.zeros(0)
     if size > 0 or "parameters" in lens:
         parameters = lens.vector("parameters", size)
-    intrinsics = entry.vector("intrinsics", INTRINSICS_SIZE[projection])
+    intrinsics = entry.vector("intrinsics", camera_models.INTRINSICS_SIZE[projection])
     if np.any(intrinsics[-4:-2] <= 0.0):
         raise MapError(f"{entry.where}: key 'intrinsics': focal lengths must be positive")
     width, height = entry.integer("image_width"), entry.integer("image_height")
@@ -277,7 +270,7 @@ def _parse_camera(entry: Entry, camera_id: str) -> Camera:
     line_delay_ns = _line_delay_ns(entry, height)
     if line_delay_ns != 0:
         extra.pop(_LINE_DELAY)
-    return Camera(
+    return camera_models.Camera(
         id=camera_id,
         projection=projection,
         distortion=distortion,
@@ -388,7 +381,7 @@ def _imu_entry(imu: Imu) -> dict[str, Any]:
     return _merged(entry, imu.extra)
 
 
-def _rig_entry(rig: CameraRig) -> dict[str, Any]:
+def _rig_entry(rig: camera_models.CameraRig) -> dict[str, Any]:
     extras = rig.camera_extra or tuple({} for _ in rig.cameras)
     cameras = []
     for camera, T_B_C, extra in zip(rig.cameras, rig.T_B_C, extras, strict=True):
@@ -409,7 +402,7 @@ def _rig_entry(rig: CameraRig) -> dict[str, Any]:
     return _merged(entry, rig.extra)
 
 
-def _camera_entry(camera: Camera) -> dict[str, Any]:
+def _camera_entry(camera: camera_models.Camera) -> dict[str, Any]:
     entry: dict[str, Any] = {
         "id": camera.id,
         "sensor_type": "CAMERA",

@@ -28,16 +28,9 @@ import numpy as np
 from maplab_py.algorithms.pose_graph_manipulation.stationary_options import StationaryOptions
 from maplab_py.errors import Cancelled, MaplabError, UserError
 from maplab_py.progress import SILENT, Progress
+from maplab_py.server import options as server_options
 from maplab_py.server.journal import Journal, MergedSubmap, recover, write_journal
 from maplab_py.server.merging import Merger, stretches_of
-from maplab_py.server.options import (
-    DeletedMissions,
-    IncrementalOptions,
-    MapServerOptions,
-    ServeReport,
-    ServerStatus,
-    ServiceOptions,
-)
 from maplab_py.server.preparation import Intake, Item, Preparation
 from maplab_py.server.publishing import Display, Publisher, pause_s
 from maplab_py.server.service import Service, answers
@@ -58,11 +51,11 @@ class MapServer:
     def __init__(
         self,
         spool: Spool,
-        options: MapServerOptions,
+        options: server_options.MapServerOptions,
         *,
         stationary: StationaryOptions | None = None,
-        incremental: IncrementalOptions | None = None,
-        service: ServiceOptions | None = None,
+        incremental: server_options.IncrementalOptions | None = None,
+        service: server_options.ServiceOptions | None = None,
         progress: Progress = SILENT,
         watch: Callable[[VIMap], None] | None = None,
         shown_at: str = "",
@@ -85,8 +78,8 @@ class MapServer:
         if not options.merged_map_folder:
             raise UserError("--maplab_server_merged_map_folder is required: where the map goes")
         self.spool, self.options = spool, options
-        self.incremental = incremental or IncrementalOptions()
-        self.service = service or ServiceOptions()
+        self.incremental = incremental or server_options.IncrementalOptions()
+        self.service = service or server_options.ServiceOptions()
         self.publisher = Publisher(options)
         self.journal = Journal()
         self.events = Events(spool.log, progress)
@@ -106,7 +99,7 @@ class MapServer:
 
     # -- from the outside -----------------------------------------------------------------------
 
-    def run(self, is_to_end: Callable[[], bool] = lambda: False) -> ServeReport:
+    def run(self, is_to_end: Callable[[], bool] = lambda: False) -> server_options.ServeReport:
         """Serve until it is asked to stop; then optimise jointly, and publish.
 
         Raises:
@@ -144,7 +137,7 @@ class MapServer:
         self._wake.set()
         return future.result()
 
-    def status(self) -> ServerStatus:
+    def status(self) -> server_options.ServerStatus:
         """Return the present state."""
         items = dict(self._intake.items)
         published = tuple(m for m in self.journal.merged if m.number not in items)
@@ -157,7 +150,7 @@ class MapServer:
             url=self._url,
         )
 
-    def delete_missions(self, ids: set[str]) -> DeletedMissions:
+    def delete_missions(self, ids: set[str]) -> server_options.DeletedMissions:
         """Remove missions from the map for good, and publish; their later submaps are refused.
 
         Called by the loop. Where the disk refuses, the map is published without them later.
@@ -179,7 +172,7 @@ class MapServer:
         self._restore(left)
         self._publish()
         self.events.add(f"deleted mission {', '.join(sorted(ids))}")
-        return DeletedMissions(tuple(sorted(ids)), vertices)
+        return server_options.DeletedMissions(tuple(sorted(ids)), vertices)
 
     # -- the loop -------------------------------------------------------------------------------
 
@@ -438,9 +431,9 @@ class MapServer:
         if folder is not None:
             self.events.add(f"backup {folder}")
 
-    def _report(self, seconds: float) -> ServeReport:
+    def _report(self, seconds: float) -> server_options.ServeReport:
         vi_map = self._merger.vi_map or VIMap()
-        return ServeReport(
+        return server_options.ServeReport(
             str(self.publisher.folder),
             self._merged_count,
             self._intake.rejected,

@@ -14,16 +14,8 @@ from maplab_py.options import violation
 from maplab_py.sensors import Distortion, Projection
 from maplab_py.sensors.camera import CAMERA_MODELS, DISTORTION_SIZE, INTRINSICS_SIZE
 from maplab_py.sensors.yaml_text import parse_yaml
+from maplab_py.simulation import scenario as sim
 from maplab_py.simulation.reports import ScenarioLine, ScenarioList
-from maplab_py.simulation.scenario import (
-    LAYOUTS,
-    MOTION_KINDS,
-    CameraOptions,
-    LidarOptions,
-    MotionOptions,
-    Scenario,
-    SessionOptions,
-)
 
 _FOLDER = Path(__file__).parent / "scenarios"
 _KINDS: dict[type, str] = {bool: "true or false", int: "a whole number", float: "a number"}
@@ -44,7 +36,7 @@ def list_scenarios() -> ScenarioList:
     return ScenarioList(tuple(lines))
 
 
-def load_scenario(name_or_path: str | Path) -> Scenario:
+def load_scenario(name_or_path: str | Path) -> sim.Scenario:
     """Read a scenario by name, or from a YAML file.
 
     Raises:
@@ -66,7 +58,7 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
     return _with_absolute_paths(parse_scenario(text, path.name), path.parent)
 
 
-def parse_scenario(text: str, source: str) -> Scenario:
+def parse_scenario(text: str, source: str) -> sim.Scenario:
     """Read a scenario from YAML text.
 
     Args:
@@ -81,7 +73,7 @@ def parse_scenario(text: str, source: str) -> Scenario:
     except MapError as error:
         raise UserError(_syntax_error(source, error)) from None
     try:
-        scenario: Scenario = _read(Scenario, content, "")
+        scenario: sim.Scenario = _read(sim.Scenario, content, "")
         check_scenario(scenario)
     except UserError as error:
         raise UserError(f"{source}: {error}") from None
@@ -97,7 +89,7 @@ def _syntax_error(source: str, error: MapError) -> str:
     return f"{source}{where}: this is not YAML: {problem}"
 
 
-def _with_absolute_paths(scenario: Scenario, folder: Path) -> Scenario:
+def _with_absolute_paths(scenario: sim.Scenario, folder: Path) -> sim.Scenario:
     """Return the scenario with the files of its sessions looked up beside the scenario file."""
 
     def beside(file: str) -> str:
@@ -168,7 +160,7 @@ _LARGEST = 1e6
 _MOST_SAMPLES = 10_000_000
 
 
-def check_scenario(scenario: Scenario) -> None:
+def check_scenario(scenario: sim.Scenario) -> None:
     """Check the values of a scenario.
 
     Raises:
@@ -190,7 +182,7 @@ def check_scenario(scenario: Scenario) -> None:
         _check_camera(camera, f"cameras[{row}]")
 
 
-def _check_times(scenario: Scenario) -> None:
+def _check_times(scenario: sim.Scenario) -> None:
     imu = scenario.imu
     if imu.time_jitter_s > 0.1 / imu.rate_hz:
         raise UserError("imu.time_jitter_s: must not exceed a tenth of the time between samples")
@@ -199,7 +191,7 @@ def _check_times(scenario: Scenario) -> None:
             raise UserError(f"cameras[{row}].line_delay_s: reads longer than 0.05 s for an image")
 
 
-def _check_lidar(lidar: LidarOptions) -> None:
+def _check_lidar(lidar: sim.LidarOptions) -> None:
     if not lidar.lowest_deg < lidar.highest_deg:
         raise UserError("lidar.lowest_deg, highest_deg: must be in order")
     if not lidar.min_range_m < lidar.max_range_m:
@@ -223,10 +215,10 @@ def _check_numbers(group: Any, key: str, bounds: Mapping[str, float]) -> None:
             raise UserError(f"{key}: {said}, not {group:g}")
 
 
-def _check_world(scenario: Scenario) -> None:
+def _check_world(scenario: sim.Scenario) -> None:
     world = scenario.world
-    if world.layout not in LAYOUTS:
-        known = ", ".join(LAYOUTS)
+    if world.layout not in sim.LAYOUTS:
+        known = ", ".join(sim.LAYOUTS)
         raise UserError(f"world.layout: must be one of {known}, not '{world.layout}'")
     if min(world.room_size_m) <= 0.0:
         raise UserError("world.room_size_m: must be greater than 0")
@@ -245,7 +237,7 @@ def _check_world(scenario: Scenario) -> None:
         raise UserError("world.corridor_rooms: leaves no room that could look like another")
 
 
-def _check_session(scenario: Scenario, session: SessionOptions, key: str) -> None:
+def _check_session(scenario: sim.Scenario, session: sim.SessionOptions, key: str) -> None:
     frames = session.total_s * scenario.measurement.frame_rate_hz
     if not frames >= 2.0:
         raise UserError(f"{key}.duration_s: too short for two frames")
@@ -262,10 +254,10 @@ def _check_session(scenario: Scenario, session: SessionOptions, key: str) -> Non
         _check_motion(scenario, phase, f"{key}.phases[{row}]")
 
 
-def _check_motion(scenario: Scenario, motion: MotionOptions, key: str) -> None:
+def _check_motion(scenario: sim.Scenario, motion: sim.MotionOptions, key: str) -> None:
     world = scenario.world
-    if motion.kind not in MOTION_KINDS:
-        known = ", ".join(MOTION_KINDS)
+    if motion.kind not in sim.MOTION_KINDS:
+        known = ", ".join(sim.MOTION_KINDS)
         raise UserError(f"{key}.kind: must be one of {known}, not '{motion.kind}'")
     if not motion.duration_s >= 0.5:
         raise UserError(f"{key}.duration_s: too short, must be at least 0.5")
@@ -287,7 +279,7 @@ def _check_motion(scenario: Scenario, motion: MotionOptions, key: str) -> None:
         raise UserError(f"{key}.height_m: leads through floor or ceiling")
 
 
-def _check_street_motion(scenario: Scenario, motion: MotionOptions, key: str) -> None:
+def _check_street_motion(scenario: sim.Scenario, motion: sim.MotionOptions, key: str) -> None:
     if motion.kind != "streets":
         raise UserError(f"{key}.kind: in a city only streets is possible")
     for first, last, count in zip(
@@ -301,7 +293,7 @@ def _check_street_motion(scenario: Scenario, motion: MotionOptions, key: str) ->
         raise UserError(f"{key}.height_m: leads through the ground")
 
 
-def _check_camera(camera: CameraOptions, key: str) -> None:
+def _check_camera(camera: sim.CameraOptions, key: str) -> None:
     for name, kinds in (("projection", Projection), ("distortion", Distortion)):
         known = [member.value for member in kinds]
         if getattr(camera, name) not in known:

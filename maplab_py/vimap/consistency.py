@@ -9,17 +9,11 @@ from maplab_py.array_types import Mask, NDArray
 from maplab_py.errors import MapError
 from maplab_py.report import Report, counted
 from maplab_py.sensors.wheels import wheel_scale
+from maplab_py.vimap import tables as map_tables
 from maplab_py.vimap.descriptors import NO_DESCRIPTOR
 from maplab_py.vimap.ids import is_valid, to_hex, to_hex_list
 from maplab_py.vimap.queries import has_link, mission_sensor_id
 from maplab_py.vimap.table import Table
-from maplab_py.vimap.tables import (
-    NO_ROW,
-    MissionSensor,
-    ResourceOwner,
-    TransformationEdges,
-    TransformationKind,
-)
 from maplab_py.vimap.vi_map import VIMap
 
 _LISTED = 5
@@ -127,7 +121,7 @@ def check_saved(vi_map: VIMap) -> list[Violation]:
     """Return the violations of a map in memory that would prevent loading it."""
     findings = _Findings()
     _check_references(vi_map, findings)
-    rootless = np.flatnonzero(vi_map.missions.root_vertex == NO_ROW)
+    rootless = np.flatnonzero(vi_map.missions.root_vertex == map_tables.NO_ROW)
     if not np.isin(vi_map.vertices.mission, rootless).any():  # empty missions need none
         findings.errors = [v for v in findings.errors if v.rule != _NO_ROOT]
     if findings.errors:
@@ -174,8 +168,8 @@ def _check_references(vi_map: VIMap, findings: _Findings) -> None:
         refer(f"{noun} from a vertex that is not there", edges.from_vertex, vertices, edges.id)
         refer(f"{noun} to a vertex that is not there", edges.to_vertex, vertices, edges.id)
     resources = vi_map.resources
-    size = np.where(resources.owner_kind == ResourceOwner.FRAME, len(f), len(m))
-    owned = resources.owner_kind != ResourceOwner.NONE
+    size = np.where(resources.owner_kind == map_tables.ResourceOwner.FRAME, len(f), len(m))
+    owned = resources.owner_kind != map_tables.ResourceOwner.NONE
     outside = owned & ((resources.owner < 0) | (resources.owner >= size))
     findings.check("resource of an owner that is not there", outside, resources.id)
     described = np.array([sum(b.keypoints for b in frame or ()) for frame in f.descriptor_blocks])
@@ -347,8 +341,8 @@ def _check_edges(vi_map: VIMap, findings: _Findings) -> None:
 def _in_circle(vi_map: VIMap, edges: Any) -> Mask:
     """Return which edges (E,) of a mission's backbone lie on a directed cycle."""
     chain = np.ones(len(edges), dtype=np.bool_)
-    if isinstance(edges, TransformationEdges):
-        chain = edges.kind != TransformationKind.TRANSFORMATION
+    if isinstance(edges, map_tables.TransformationEdges):
+        chain = edges.kind != map_tables.TransformationKind.TRANSFORMATION
     start, stop = edges.from_vertex[chain], edges.to_vertex[chain]
     circle = np.zeros(len(edges), dtype=np.bool_)
     if not np.any(stop <= start):  # rows are in the order of time
@@ -411,7 +405,7 @@ def _check_sensors(vi_map: VIMap, findings: _Findings) -> None:
     for row in range(len(vi_map.missions)):
         missing = [
             kind.name.lower()
-            for kind in MissionSensor
+            for kind in map_tables.MissionSensor
             if (sensor_id := mission_sensor_id(vi_map, row, kind)) and sensor_id not in known
         ]
         if missing:

@@ -7,13 +7,8 @@ import numpy as np
 from maplab_py.array_types import Mask
 from maplab_py.geometry import se3
 from maplab_py.report import counted
+from maplab_py.vimap import edits
 from maplab_py.vimap.consistency import LOADED_UNIT_TOLERANCE
-from maplab_py.vimap.edits import (
-    remove_keypoints,
-    remove_landmarks,
-    remove_missions,
-    remove_vertices,
-)
 from maplab_py.vimap.table import Table
 from maplab_py.vimap.vi_map import VIMap
 
@@ -90,13 +85,13 @@ def without_bad_numbers(vi_map: VIMap) -> tuple[VIMap, list[str]]:
             vi_map = vi_map.replace(**{field: table.take(~bad)})
     bad = _bad(vi_map.keypoints, "uv_px", "sigma_px", "scale")
     if note(bad, "keypoint", _DROPPED):
-        vi_map = remove_keypoints(vi_map, bad)
+        vi_map = edits.remove_keypoints(vi_map, bad)
     bad = _bad(vi_map.vertices, "T_M_I")
     stored = bad[vi_map.landmarks.vertex]
     note(bad, "vertex", _DROPPED, "vertices")
     bad = _bad(vi_map.landmarks, "p_I") | stored  # their place is relative to that of the vertex
     note(bad, "landmark", _DROPPED)
-    return _without_vertices(remove_landmarks(vi_map, bad)), notes
+    return _without_vertices(edits.remove_landmarks(vi_map, bad)), notes
 
 
 def _without_vertices(vi_map: VIMap) -> VIMap:
@@ -107,9 +102,9 @@ def _without_vertices(vi_map: VIMap) -> VIMap:
     left = np.bincount(vi_map.vertices.mission[~bad], minlength=len(vi_map.missions))
     lost = (left == 0) & (np.diff(vi_map.vertex_start) > 0)
     if lost.any():
-        vi_map = remove_missions(vi_map, lost)
+        vi_map = edits.remove_missions(vi_map, lost)
         bad = _bad(vi_map.vertices, "T_M_I")
-    return remove_vertices(vi_map, bad)
+    return edits.remove_vertices(vi_map, bad)
 
 
 def _bad(table: Table, *names: str) -> Mask:

@@ -2,12 +2,7 @@
 
 from pathlib import Path
 
-from maplab_py.interop.colmap.options import (
-    ColmapExportOptions,
-    ColmapExportReport,
-    ColmapImportOptions,
-    ColmapImportReport,
-)
+from maplab_py.interop.colmap import options as colmap_options
 from maplab_py.plugin import CommandContext, UserError, command, key_of_folder
 
 
@@ -22,9 +17,9 @@ def export_colmap(
     colmap_folder: Path | None = None,
     *,
     missions: str = "",
-    options: ColmapExportOptions = ColmapExportOptions(),
+    options: colmap_options.ColmapExportOptions = colmap_options.ColmapExportOptions(),
     overwrite: bool = False,
-) -> ColmapExportReport:
+) -> colmap_options.ColmapExportReport:
     """Write missions as a COLMAP model: cameras, rigs, frames, images, points.
 
     Each vertex with images becomes a frame, each observed landmark a point; the world is the map's frame G.
@@ -58,9 +53,9 @@ def import_colmap(
     colmap_folder: Path | None = None,
     *,
     database: Path | None = None,
-    options: ColmapImportOptions = ColmapImportOptions(),
+    options: colmap_options.ColmapImportOptions = colmap_options.ColmapImportOptions(),
     map_key: str = "",
-) -> ColmapImportReport:
+) -> colmap_options.ColmapImportReport:
     """Make a map of a COLMAP model: a mission of each rig, with odometry edges and landmarks, without IMU.
 
     The reference sensor of a rig becomes the body frame. Scale and gravity of a model are arbitrary unless

@@ -5,14 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from maplab_py.algorithms.dense.options import (
-    MESH_MIN_WEIGHT,
-    BmOptions,
-    DistanceOptions,
-    FusionOptions,
-    SgbmOptions,
-    StereoOptions,
-)
+from maplab_py.algorithms.dense import options as dense_options
 from maplab_py.plugin import (
     ALL_MISSIONS,
     CommandContext,
@@ -29,7 +22,11 @@ if TYPE_CHECKING:
     from maplab_py.algorithms.dense.meshing import MeshReport
     from maplab_py.algorithms.dense.reconstruction import StereoReport
 
-_STEREO, _SGBM, _BM = StereoOptions(), SgbmOptions(), BmOptions()
+_STEREO, _SGBM, _BM = (
+    dense_options.StereoOptions(),
+    dense_options.SgbmOptions(),
+    dense_options.BmOptions(),
+)
 
 
 @command(
@@ -45,9 +42,9 @@ def stereo_dense_reconstruction(
     missions: MissionChoice = ALL_MISSIONS,
     dense_depth_resource_output_type: int = 8,
     overwrite: bool = False,
-    stereo: StereoOptions = _STEREO,
-    sgbm: SgbmOptions = _SGBM,
-    bm: BmOptions = _BM,
+    stereo: dense_options.StereoOptions = _STEREO,
+    sgbm: dense_options.SgbmOptions = _SGBM,
+    bm: dense_options.BmOptions = _BM,
 ) -> StereoReport:
     """Compute depth from the stereo images of every vertex, by OpenCV's block matching.
 
@@ -101,12 +98,12 @@ def create_tsdf_from_depth_resource(
     *,
     missions: MissionChoice = ALL_MISSIONS,
     dense_depth_resource_input_type: str = "",
-    options: FusionOptions = FusionOptions(),
+    options: dense_options.FusionOptions = dense_options.FusionOptions(),
     update: bool = False,
     dense_update_threshold_m: float = 0.01,
     dense_max_memory_gb: float = 0.0,
     dense_result_mesh_output_file: Path | None = None,
-    dense_tsdf_mesh_min_weight: float = MESH_MIN_WEIGHT,
+    dense_tsdf_mesh_min_weight: float = dense_options.MESH_MIN_WEIGHT,
     overwrite: bool = False,
 ) -> FusionReport:
     """Fuse the depth of cameras into a grid of truncated signed distances.
@@ -175,9 +172,9 @@ def create_esdf_from_depth_resource(
     *,
     missions: MissionChoice = ALL_MISSIONS,
     dense_depth_resource_input_type: str = "",
-    options: DistanceOptions = DistanceOptions(),
-    fusion: FusionOptions = FusionOptions(),
-    dense_tsdf_mesh_min_weight: float = MESH_MIN_WEIGHT,
+    options: dense_options.DistanceOptions = dense_options.DistanceOptions(),
+    fusion: dense_options.FusionOptions = dense_options.FusionOptions(),
+    dense_tsdf_mesh_min_weight: float = dense_options.MESH_MIN_WEIGHT,
     dense_max_memory_gb: float = 0.0,
     overwrite: bool = False,
 ) -> FieldsReport:
@@ -234,7 +231,7 @@ def create_mesh_from_tsdf_grid(
     *,
     dense_result_mesh_output_file: Path,
     missions: MissionChoice = ALL_MISSIONS,
-    dense_tsdf_mesh_min_weight: float = MESH_MIN_WEIGHT,
+    dense_tsdf_mesh_min_weight: float = dense_options.MESH_MIN_WEIGHT,
     dense_result_mesh_colours: bool = False,
     overwrite: bool = False,
 ) -> MeshReport:

@@ -1,10 +1,7 @@
 """Manipulation of the pose graph: uncertainties, switch variables, disturbed vertices."""
 
+from maplab_py.algorithms.pose_graph_manipulation import layout
 from maplab_py.algorithms.pose_graph_manipulation.edges import EdgeType
-from maplab_py.algorithms.pose_graph_manipulation.layout import (
-    DisturbanceOptions,
-    DisturbanceReport,
-)
 from maplab_py.plugin import ALL_MISSIONS, CommandContext, Message, MissionChoice, command
 from maplab_py.report import counted
 
@@ -93,9 +90,9 @@ def assign_switch_variable_uncertainties(
 def artificially_disturb_vertices(
     context: CommandContext,
     *,
-    options: DisturbanceOptions = DisturbanceOptions(),
+    options: layout.DisturbanceOptions = layout.DisturbanceOptions(),
     chosen: MissionChoice = ALL_MISSIONS,
-) -> DisturbanceReport:
+) -> layout.DisturbanceReport:
     """Disturb all vertices by a random walk, to test what corrects it."""
     from maplab_py.algorithms.pose_graph_manipulation.layout import disturb_vertices
 

@@ -10,12 +10,7 @@ from maplab_py.algorithms.pose_graph_manipulation.stationary_options import Stat
 from maplab_py.cancellation import ending_early, lasting_effect
 from maplab_py.plugin import CommandContext, Message, UserError, command
 from maplab_py.report import counted
-from maplab_py.server.options import (
-    IncrementalOptions,
-    MapServerOptions,
-    PlayOptions,
-    ServiceOptions,
-)
+from maplab_py.server import options as server_options
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -47,10 +42,10 @@ def serve(
     context: CommandContext,
     *,
     spool: Path,
-    server: MapServerOptions = MapServerOptions(),
+    server: server_options.MapServerOptions = server_options.MapServerOptions(),
     stationary: StationaryOptions = StationaryOptions(),
-    incremental: IncrementalOptions = IncrementalOptions(),
-    service: ServiceOptions = ServiceOptions(),
+    incremental: server_options.IncrementalOptions = server_options.IncrementalOptions(),
+    service: server_options.ServiceOptions = server_options.ServiceOptions(),
     serve_visualize_map: bool = False,
 ) -> ServeReport:
     """Merge the submaps that robots put into a spool into one map, and publish it.
@@ -318,7 +313,7 @@ def simulate_robots(
     scenario: str = "four_sessions",
     seed: int | None = None,
     maps_folder: Path | None = None,
-    play: PlayOptions = PlayOptions(),
+    play: server_options.PlayOptions = server_options.PlayOptions(),
 ) -> PlayedRobots:
     """Play robots: cut their sessions into submaps and put each into a spool when its time has come.
 

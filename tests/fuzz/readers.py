@@ -54,13 +54,7 @@ from maplab_py.storage.native import load_map, save_map
 from tests.fuzz.messages import message_seeds, read_message
 from tests.interop import test_clouds_and_meshes as clouds
 from tests.interop.calibrations import small_files, test_oddities
-from tests.interop.recordings.written import (
-    make_content,
-    sensor_yaml,
-    write_bag,
-    write_calibration,
-    write_folder,
-)
+from tests.interop.recordings import written
 from tests.support.scene import Scene
 
 _MAGIC = b"maplab-py columns 1\n"
@@ -115,7 +109,7 @@ def _calibration_seeds(folder: Path) -> list[bytes]:
         *(test_oddities.CAMERA, test_oddities.IMU, test_oddities.EUROC, test_oddities.OLD_IMU),
         *(test_oddities.NCAMERA, test_oddities.OKVIS, small_files.VINS_MONO, small_files.MEI),
         *(small_files.ORB_NEW, small_files.ORB_OLD, small_files.OKVIS, small_files.SVO),
-        *(small_files.CAMERA_INFO, small_files.ECHOED, small_files.KANNALA, sensor_yaml(0)),
+        *(small_files.CAMERA_INFO, small_files.ECHOED, small_files.KANNALA, written.sensor_yaml(0)),
     ]
     seeds = [b"\0" + text.encode() for text in texts]
     sensors = _map().sensors
@@ -399,12 +393,12 @@ def _read_segments(folder: Path, data: bytes) -> None:
 
 
 def _make_recording(folder: Path) -> None:
-    content = make_content(cameras=1, frames=2)
-    device = import_calibration(write_folder(content, folder / "room"))
-    write_calibration(device, folder / "sensors.yaml")
-    write_bag(content, folder / "1.bag")
-    write_bag(content, folder / "2", version=2)
-    write_bag(content, folder / "3", version=2, storage="mcap", encoding="png")
+    content = written.make_content(cameras=1, frames=2)
+    device = import_calibration(written.write_folder(content, folder / "room"))
+    written.write_calibration(device, folder / "sensors.yaml")
+    written.write_bag(content, folder / "1.bag")
+    written.write_bag(content, folder / "2", version=2)
+    written.write_bag(content, folder / "3", version=2, storage="mcap", encoding="png")
 
 
 _BAGS = ("walk.bag", "walk.db3", "walk.mcap")

@@ -7,14 +7,7 @@ import numpy as np
 import pytest
 
 from maplab_py.errors import MapError
-from maplab_py.interop.images import (
-    ENCODINGS,
-    as_8_bits,
-    as_grey,
-    bits_of,
-    encoded_pixels,
-    raw_pixels,
-)
+from maplab_py.interop import images
 
 HEIGHT, WIDTH = 48, 64
 PATTERNS = {"rggb": "RGGB", "bggr": "BGGR", "gbrg": "GBRG", "grbg": "GRBG"}
@@ -40,7 +33,7 @@ def read(encoding: str, stored: np.ndarray, padding: int = 6, **options: Any) ->
     rows = np.ascontiguousarray(stored).view(np.uint8).reshape(stored.shape[0], -1)
     rows = np.pad(rows, ((0, 0), (0, padding)))
     data = rows.tobytes()
-    return raw_pixels("image", encoding, WIDTH, HEIGHT, rows.shape[1], data, **options)
+    return images.raw_pixels("image", encoding, WIDTH, HEIGHT, rows.shape[1], data, **options)
 
 
 @pytest.mark.parametrize("pattern", PATTERNS)
@@ -49,7 +42,7 @@ def test_mosaics(pattern: str, bits: int) -> None:
     image = scene().astype(np.uint16) << (bits - 8) if bits > 8 else scene()
     pixels = read(f"bayer_{pattern}{bits}", mosaic(image, PATTERNS[pattern]))
     assert pixels.shape == image.shape
-    error = as_8_bits(pixels, bits)[2:-2, 2:-2].astype(int) - scene()[2:-2, 2:-2]
+    error = images.as_8_bits(pixels, bits)[2:-2, 2:-2].astype(int) - scene()[2:-2, 2:-2]
     assert np.abs(error).max() <= 6
 
 
@@ -67,7 +60,7 @@ def test_luminance_and_chroma(name: str) -> None:
         order = [chroma, y] if name in ("yuv422", "uyvy") else [y, chroma]
         stored = np.stack(order, axis=2).reshape(HEIGHT, -1)
     padding = 0 if name == "i420" else 6
-    grey = as_grey(read(name, stored, padding), 8)
+    grey = images.as_grey(read(name, stored, padding), 8)
     # BT.601 of video range; the plane itself is of full range
     expected = np.clip((y.astype(float) - 16.0) * 255.0 / 219.0, 0, 255)
     assert np.abs(grey - expected).max() < 12
@@ -91,23 +84,25 @@ def test_channels_in_any_order(order: str, dtype: type, is_big_endian: bool) -> 
 def test_the_range_of_a_camera(bits: int) -> None:
     image = (np.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH) % (1 << bits)).astype(np.uint16)
     image[0, 0] = (1 << bits) - 1
-    assert bits_of([image // 3, image]) == bits
-    eight = as_8_bits(read("mono16", image), bits)
+    assert images.bits_of([image // 3, image]) == bits
+    eight = images.as_8_bits(read("mono16", image), bits)
     assert (int(eight.max()), eight.dtype) == (255, np.uint8)
     np.testing.assert_array_equal(eight, image >> (bits - 8))
 
 
 def test_values_beyond_a_given_range_become_white() -> None:
-    assert as_8_bits(np.array([[5000, 4095, 16]], dtype=np.uint16), 12).tolist() == [[255, 255, 1]]
+    assert images.as_8_bits(np.array([[5000, 4095, 16]], dtype=np.uint16), 12).tolist() == [
+        [255, 255, 1]
+    ]
 
 
 def test_compressed_mosaics() -> None:
     data = cv2.imencode(".png", mosaic(scene(), "RGGB"))[1].tobytes()
-    pixels = encoded_pixels("image", data, "bayer_rggb8; png compressed ")
+    pixels = images.encoded_pixels("image", data, "bayer_rggb8; png compressed ")
     assert np.abs(pixels[2:-2, 2:-2].astype(int) - scene()[2:-2, 2:-2]).max() <= 6
-    assert encoded_pixels("image", data, "mono8; png compressed ").ndim == 2
+    assert images.encoded_pixels("image", data, "mono8; png compressed ").ndim == 2
     colours = cv2.imencode(".jpg", scene())[1].tobytes()
-    assert encoded_pixels("image", colours, "bayer_rggb8; jpeg compressed bgr8").ndim == 3
+    assert images.encoded_pixels("image", colours, "bayer_rggb8; jpeg compressed bgr8").ndim == 3
 
 
 @pytest.mark.parametrize(
@@ -125,7 +120,7 @@ def test_compressed_mosaics() -> None:
 )
 def test_other_messages_are_named(data: bytes, form: str, words: str) -> None:
     with pytest.raises(MapError, match=words):
-        encoded_pixels("image", data, form)
+        images.encoded_pixels("image", data, form)
 
 
 @pytest.mark.parametrize("name", ["32FC1", "64FC3", "mono12p", "8UC2", ""])
@@ -135,6 +130,6 @@ def test_unknown_encodings_are_named(name: str) -> None:
 
 
 def test_short_data_are_refused_for_every_encoding() -> None:
-    for name in ENCODINGS:
+    for name in images.ENCODINGS:
         with pytest.raises(MapError, match="truncated"):
-            raw_pixels("image", name, WIDTH, HEIGHT, WIDTH, bytes(WIDTH * HEIGHT - 1))
+            images.raw_pixels("image", name, WIDTH, HEIGHT, WIDTH, bytes(WIDTH * HEIGHT - 1))

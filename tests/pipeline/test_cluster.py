@@ -14,16 +14,7 @@ import pytest
 from maplab_py.errors import UserError
 from maplab_py.pipeline import PipelineOptions, Watcher, run_pipeline
 from tests.e2e.support import PROGRAM, environment, run_program
-from tests.pipeline.support import (
-    MERGED,
-    child_processes,
-    contents,
-    is_alive,
-    pipeline,
-    sessions,
-    small_maps,
-    starts,
-)
+from tests.pipeline import support
 from tests.support.waiting import wait_until
 
 pytest.importorskip("distributed")
@@ -70,7 +61,7 @@ def scheduler(tmp_path: Path) -> Iterator[str]:
 
 def task_of(process: int) -> int:
     """Return the process of the task that a worker runs, 0 while there is none."""
-    for child in child_processes(process):
+    for child in support.child_processes(process):
         words = Path(f"/proc/{child}/cmdline").read_text().split("\0")
         if "maplab_py" in words:
             return child
@@ -80,7 +71,7 @@ def task_of(process: int) -> int:
 def busy_worker(driver: int) -> int:
     """Return a local worker that runs a task, 0 while there is none."""
     try:
-        return next((child for child in child_processes(driver) if task_of(child)), 0)
+        return next((child for child in support.child_processes(driver) if task_of(child)), 0)
     except (FileNotFoundError, ProcessLookupError):
         return 0
 
@@ -100,12 +91,12 @@ def started(
 
 
 def make_file(folder: Path, count: int) -> None:
-    small_maps(folder / "maps", count)
+    support.small_maps(folder / "maps", count)
     (folder / "p.yaml").write_text(FILE)
 
 
 def test_a_lost_worker_costs_one_task(tmp_path: Path) -> None:
-    maps = small_maps(tmp_path / "maps", 3)
+    maps = support.small_maps(tmp_path / "maps", 3)
     killed: list[int] = []
 
     def kill_one() -> None:
@@ -119,15 +110,15 @@ def test_a_lost_worker_costs_one_task(tmp_path: Path) -> None:
     lines: list[str] = []
     killer.start()
     report = run_pipeline(
-        pipeline(maps, sessions("!sleep 2"), MERGED),
+        support.pipeline(maps, support.sessions("!sleep 2"), support.MERGED),
         tmp_path / "r",
         PipelineOptions(scheduler="local:2"),
         watcher=Watcher(line=lines.append),
     )
     killer.join()
     assert report.failure == ""
-    assert not is_alive(killed[0])
-    assert len(starts(tmp_path / "r")) == 4 + 1
+    assert not support.is_alive(killed[0])
+    assert len(support.starts(tmp_path / "r")) == 4 + 1
     assert "Dask's dashboard: http://127.0.0.1:" in lines[0]
 
 
@@ -137,13 +128,13 @@ def test_a_killed_driver_leaves_nobody_and_resuming_does_the_rest(tmp_path: Path
     results = tmp_path / "p_results"
     child = started(tmp_path, "3")
     assert wait_until(lambda: list(results.glob("tasks/sessions/*.json")), 120.0)
-    workers = child_processes(child.pid)
+    workers = support.child_processes(child.pid)
     tasks = [task_of(worker) for worker in workers if task_of(worker)]
     child.kill()
     child.wait()
     finished = len(list(results.glob("tasks/sessions/*.json")))
     assert 0 < finished < 4
-    assert wait_until(lambda: not any(map(is_alive, [*workers, *tasks])), 60.0)
+    assert wait_until(lambda: not any(map(support.is_alive, [*workers, *tasks])), 60.0)
     words = ("batch", "p.yaml", "--resume", "--json")
     done = run_program(tmp_path, *words, extra={"PAUSE_S": "0"}, seconds=400)
     assert done.returncode == 0, done.stderr
@@ -156,7 +147,7 @@ def test_interrupt_stops_all_workers(tmp_path: Path, is_ignored: bool) -> None:
     make_file(tmp_path, 3)
     child = started(tmp_path, "60", interrupts_ignored=is_ignored)
     assert wait_until(lambda: busy_worker(child.pid), 60.0)
-    workers = child_processes(child.pid)
+    workers = support.child_processes(child.pid)
     tasks = [task_of(worker) for worker in workers if task_of(worker)]
     os.killpg(child.pid, signal.SIGINT)
     _, errors = child.communicate(timeout=60)
@@ -165,7 +156,7 @@ def test_interrupt_stops_all_workers(tmp_path: Path, is_ignored: bool) -> None:
         "error: batch: cancelled; finished tasks are kept (--resume runs the others)"
     )
     assert "Traceback" not in errors
-    assert wait_until(lambda: not any(map(is_alive, [*workers, *tasks])), 30.0)
+    assert wait_until(lambda: not any(map(support.is_alive, [*workers, *tasks])), 30.0)
 
 
 @pytest.mark.slow
@@ -177,14 +168,14 @@ def test_a_scheduler_on_loopback_gives_the_same_bytes(tmp_path: Path, scheduler:
         words = ("batch", "p.yaml", *flags)
         done = run_program(tmp_path, *words, extra={"PAUSE_S": "0"}, seconds=400)
         assert done.returncode == 0, done.stderr
-        folders[name] = contents(tmp_path / name)
+        folders[name] = support.contents(tmp_path / name)
     assert len(folders["a"]) > 3 * 5
     assert folders["a"] == folders["b"] == folders["c"]
 
 
 def test_a_scheduler_that_does_not_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("maplab_py.pipeline.cluster._SECONDS_TO_CONNECT", 0.5)
-    plan = pipeline(small_maps(tmp_path, 1), sessions())
+    plan = support.pipeline(support.small_maps(tmp_path, 1), support.sessions())
     for address in ("tcp://127.0.0.1:1", "tcp://nowhere.invalid:8786"):
         with pytest.raises(UserError, match="no scheduler answers there; start one") as error:
             run_pipeline(plan, tmp_path / "r", PipelineOptions(scheduler=address))
@@ -194,6 +185,6 @@ def test_a_scheduler_that_does_not_answer(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_without_dask_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    plan = pipeline(small_maps(tmp_path, 1), sessions())
+    plan = support.pipeline(support.small_maps(tmp_path, 1), support.sessions())
     with pytest.raises(UserError, match=r"pip install 'maplab-py\[cluster\]'"):
         run_pipeline(plan, tmp_path / "r", PipelineOptions(scheduler="local:1"))

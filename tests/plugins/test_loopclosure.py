@@ -13,12 +13,8 @@ from maplab_plugins.visualization.following import Following
 
 from maplab_py.algorithms.cloud_registration import registration
 from maplab_py.algorithms.landmarks.quality import LandmarkExplanation
+from maplab_py.algorithms.loop_closure import explanation
 from maplab_py.algorithms.loop_closure.closure_record import read_record
-from maplab_py.algorithms.loop_closure.explanation import (
-    ClosureExplanation,
-    MissionExplanation,
-    PairExplanation,
-)
 from maplab_py.console.prompt.completion import complete
 from maplab_py.console.session.session import Session
 from maplab_py.console.terminal.render import rendered
@@ -276,10 +272,10 @@ def closed_rooms() -> Session:
 def test_the_argument_is_resolved(closed_rooms: Session) -> None:
     closure = to_hex(read_record(closed_rooms.vi_map).closures.id[0])[:8]
     landmark = to_hex(closed_rooms.vi_map.landmarks.id[3])
-    assert isinstance(closed_rooms.run("why", closure), ClosureExplanation)
-    assert isinstance(closed_rooms.run("why", "monday"), MissionExplanation)
-    assert isinstance(closed_rooms.run("why", "tue"), MissionExplanation)
-    assert isinstance(closed_rooms.run("why", "monday", "tuesday"), PairExplanation)
+    assert isinstance(closed_rooms.run("why", closure), explanation.ClosureExplanation)
+    assert isinstance(closed_rooms.run("why", "monday"), explanation.MissionExplanation)
+    assert isinstance(closed_rooms.run("why", "tue"), explanation.MissionExplanation)
+    assert isinstance(closed_rooms.run("why", "monday", "tuesday"), explanation.PairExplanation)
     assert isinstance(closed_rooms.run("why", landmark), LandmarkExplanation)
 
 

@@ -20,15 +20,7 @@ from maplab_py.console.session.status import Status
 from maplab_py.console.terminal.output import ConsoleTerminal
 from maplab_py.vimap import MissionSensor
 from maplab_py.vimap.ids import to_hex
-from tests.registry.workspace import (
-    MERGED,
-    OTHER_EXAMPLES,
-    SLOW,
-    WITH_ROBOT,
-    digest,
-    lines_before,
-    make_workspace,
-)
+from tests.registry import workspace
 from tests.support.data import REPOSITORY
 
 Capture = pytest.CaptureFixture[str]
@@ -36,9 +28,9 @@ Capture = pytest.CaptureFixture[str]
 REGISTRY = load_registry()
 COMMANDS = [command for command in REGISTRY.commands if REGISTRY.is_built_in(command)]
 NAMES = [
-    pytest.param(c.name, marks=pytest.mark.slow if c.name in SLOW else ())
+    pytest.param(c.name, marks=pytest.mark.slow if c.name in workspace.SLOW else ())
     for c in COMMANDS
-    if c.name not in WITH_ROBOT
+    if c.name not in workspace.WITH_ROBOT
 ]
 ALL_NAMES = [command.name for command in COMMANDS]
 
@@ -80,7 +72,7 @@ WRITES = _Writes()
 @pytest.fixture(scope="module")
 def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("workspace")
-    make_workspace(folder)
+    workspace.make_workspace(folder)
     return folder
 
 
@@ -106,9 +98,9 @@ def runner(bare: Runner, original: Path, tmp_path: Path, monkeypatch: pytest.Mon
 
 def prepare(runner: Runner, name: str, capsys: Capture) -> str:
     """Type what must precede the command's example; return the example."""
-    assert runner.run_text(lines_before(name)) == Status.OK, capsys.readouterr().err
+    assert runner.run_text(workspace.lines_before(name)) == Status.OK, capsys.readouterr().err
     capsys.readouterr()
-    example = OTHER_EXAMPLES.get(name, REGISTRY.find(name).example)
+    example = workspace.OTHER_EXAMPLES.get(name, REGISTRY.find(name).example)
     if name == "tour":  # somebody has to type
         runner.terminal.is_prompt = True
     if name == "remove_mission_interactive":  # somebody has to answer
@@ -152,12 +144,14 @@ def test_its_example_runs_and_can_be_tried_and_undone(
 ) -> None:
     example = prepare(runner, name, capsys)
     state = runner.session.maps.state
-    fingerprint = digest(dict(state.entries))
+    fingerprint = workspace.digest(dict(state.entries))
     command = REGISTRY.find(name)
     if not command.acts_outside or command.obeys_dry_run:
         try_out(runner, name, example.replace(" --dry_run", ""), capsys)
     assert runner.run_text(example) == Status.OK, capsys.readouterr().err
-    assert digest(dict(state.entries)) == fingerprint, "the command wrote into a map's arrays"
+    assert workspace.digest(dict(state.entries)) == fingerprint, (
+        "the command wrote into a map's arrays"
+    )
     lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     check_schema([line for line in lines if line["command"] == name])
     if name not in ("undo", "redo", "select_map"):
@@ -204,15 +198,15 @@ def undo_and_redo(runner: Runner, before: MapsState) -> None:
 
 def test_most_editing_commands_edit_in_their_examples(runner: Runner, capsys: Capture) -> None:
     """Guard the test before this one against examples that do nothing."""
-    assert runner.run_text(MERGED) == Status.OK
+    assert runner.run_text(workspace.MERGED) == Status.OK
     before = runner.session.vi_map
-    fingerprint = digest(before)
+    fingerprint = workspace.digest(before)
     for line in ("rlq", "sbk --map_mission=59f0", "optvi --ba_num_iterations=1", "rtl", "kfh"):
         assert runner.run_text(line) == Status.OK
-        assert digest(runner.session.vi_map) != fingerprint, line
+        assert workspace.digest(runner.session.vi_map) != fingerprint, line
         assert runner.run_text("undo") == Status.OK
         assert runner.session.vi_map is before
-    assert digest(before) == fingerprint
+    assert workspace.digest(before) == fingerprint
     capsys.readouterr()
 
 

@@ -15,13 +15,7 @@ from pymap3d import enu2geodetic
 
 from maplab_py.console.session.session import Session
 from maplab_py.geometry import se3
-from maplab_py.simulation.scenario import (
-    LidarOptions,
-    MeasurementOptions,
-    Scenario,
-    SessionOptions,
-    WorldOptions,
-)
+from maplab_py.simulation import scenario as sim
 from maplab_py.storage.native import save_map
 from maplab_py.vimap import VIMap
 from tests.frontend.simulated import REST_FIRST, replayed
@@ -31,23 +25,23 @@ from tests.simulation.small import simulated
 from tests.support.small_xfeat import checkpoint, random_arrays
 from tests.support.stereo_room import StereoRoom, quarter_size
 
-ROUND = Scenario(
+ROUND = sim.Scenario(
     name="round",
-    world=WorldOptions(landmarks_per_room=1200),
-    measurement=MeasurementOptions(frame_rate_hz=3.0, max_keypoints=150),
+    world=sim.WorldOptions(landmarks_per_room=1200),
+    measurement=sim.MeasurementOptions(frame_rate_hz=3.0, max_keypoints=150),
     sessions=(
-        SessionOptions(duration_s=20.0, turns=1.3),
-        SessionOptions(duration_s=20.0, turns=1.3, start_turn=0.1),
+        sim.SessionOptions(duration_s=20.0, turns=1.3),
+        sim.SessionOptions(duration_s=20.0, turns=1.3, start_turn=0.1),
     ),
 )
 """Two walks round a room, each with a loop and much in common."""
 
-SCANNED = Scenario(
+SCANNED = sim.Scenario(
     name="scanned",
-    world=WorldOptions(landmarks_per_room=800),
-    measurement=MeasurementOptions(max_keypoints=60),
-    lidar=LidarOptions(rate_hz=0.5, columns=600),
-    sessions=(SessionOptions(duration_s=22.0, turns=1.7),),
+    world=sim.WorldOptions(landmarks_per_room=800),
+    measurement=sim.MeasurementOptions(max_keypoints=60),
+    lidar=sim.LidarOptions(rate_hz=0.5, columns=600),
+    sessions=(sim.SessionOptions(duration_s=22.0, turns=1.7),),
 )
 """A walk round a room with a lidar."""
 

@@ -10,12 +10,8 @@ from maplab_py.errors import EstimationError
 from maplab_py.estimation.blocks import ParameterBlocks
 from maplab_py.estimation.terms.cameras import EXTRINSICS, INTRINSICS
 from maplab_py.geometry import se3
+from maplab_py.research import joint_ekf
 from maplab_py.research.ekf_tracks import linearised, tracks_of
-from maplab_py.research.joint_ekf import (
-    WINDOW,
-    JointFilter,
-    filter_jointly,
-)
 from maplab_py.sensors.sensor_set import Sensor
 from maplab_py.vimap import VIMap
 from tests.algorithms.self_calibration.scenes import OPTIONS, device, nominal, scene_map
@@ -32,7 +28,7 @@ def with_known_lens(truth: VIMap) -> VIMap:
     return truth.replace(sensors=dataclasses.replace(truth.sensors, sensors=sensors))
 
 
-def error(truth: VIMap, result: JointFilter) -> np.ndarray:
+def error(truth: VIMap, result: joint_ekf.JointFilter) -> np.ndarray:
     true = filter_jointly_blocks(truth)
     return result.parameters.difference(result.blocks, true)
 
@@ -49,7 +45,7 @@ def filter_jointly_blocks(truth: VIMap) -> ParameterBlocks:
 
 
 def test_without_noise_the_truth_is_a_fixed_point() -> None:
-    result = filter_jointly(scene_map(vertices=41), OPTIONS)
+    result = joint_ekf.filter_jointly(scene_map(vertices=41), OPTIONS)
     assert np.abs(result.change).max() <= 1e-9
     assert result.tracks_used > 50
     assert result.tracks_rejected == 0
@@ -58,7 +54,7 @@ def test_without_noise_the_truth_is_a_fixed_point() -> None:
 def test_without_noise_the_calibration_is_approached() -> None:
     truth = scene_map(vertices=121)
     start = with_known_lens(truth)
-    result = filter_jointly(start, OPTIONS)
+    result = joint_ekf.filter_jointly(start, OPTIONS)
     after = error(truth, result)
     sigma = np.sqrt(np.diag(result.covariance))
     assert np.abs(after / sigma).max() <= 0.5
@@ -76,7 +72,7 @@ def test_errors_are_about_as_large_as_announced() -> None:
     total, seeds = 0.0, 8
     for seed in range(1, seeds + 1):
         truth = scene_map(vertices=81, noise=1.0, seed=seed)
-        result = filter_jointly(with_known_lens(truth), OPTIONS)
+        result = joint_ekf.filter_jointly(with_known_lens(truth), OPTIONS)
         off = error(truth, result)
         total += float(off @ np.linalg.solve(result.covariance, off))
         assert result.mean_square == pytest.approx(1.0, abs=0.3)
@@ -87,7 +83,7 @@ def test_errors_are_about_as_large_as_announced() -> None:
 def test_derivatives_of_tracks() -> None:
     vi_map = scene_map(vertices=21)
     _, rig = device(vi_map)
-    tracks = tracks_of(vi_map, np.arange(21), rig.cameras, WINDOW)
+    tracks = tracks_of(vi_map, np.arange(21), rig.cameras, joint_ekf.WINDOW)
     T_G_I, T_I_C = vi_map.T_G_I, rig.T_B_C
     chosen = np.arange(min(5, len(tracks.camera)))
     at = linearised(tracks, chosen, T_G_I, T_I_C, T_G_I)
@@ -110,13 +106,13 @@ def test_derivatives_of_tracks() -> None:
 def test_intrinsics_alone_are_refused() -> None:
     options = dataclasses.replace(OPTIONS, states="intrinsics")
     with pytest.raises(EstimationError, match="neither intrinsics"):
-        filter_jointly(scene_map(vertices=21), options)
+        joint_ekf.filter_jointly(scene_map(vertices=21), options)
 
 
 def test_only_what_is_asked_for_moves() -> None:
     truth = scene_map(vertices=61)
     options = dataclasses.replace(OPTIONS, states="extrinsics_rotation")
-    result = filter_jointly(with_known_lens(truth), options)
+    result = joint_ekf.filter_jointly(with_known_lens(truth), options)
     assert isinstance(result.parameters, Parameters)
     assert len(result.parameters) == 3
     moved = result.blocks[EXTRINSICS].difference(result.before[EXTRINSICS].values)[0]

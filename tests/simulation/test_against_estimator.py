@@ -15,16 +15,9 @@ from maplab_py.estimation.imu.inertial_data import InertialData
 from maplab_py.estimation.imu.preintegration import integrate
 from maplab_py.geometry import so3
 from maplab_py.sensors import Imu, ImuIntrinsics
+from maplab_py.simulation import scenario as sim
 from maplab_py.simulation.imu import measure
 from maplab_py.simulation.motion import motion_spline
-from maplab_py.simulation.scenario import (
-    CalibrationOptions,
-    CameraOptions,
-    ImuOptions,
-    Scenario,
-    SessionOptions,
-    WorldOptions,
-)
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate
 from maplab_py.simulation.truth import true_map
@@ -38,7 +31,7 @@ AT_TRUTH = VIOptimizationOptions(
     hide_iterations_console_output=True,
 )
 RESIDUALS_PER = {"reprojection": 2, "inertial": 9, "bias walk": 6}
-DEVIATIONS = CalibrationOptions(
+DEVIATIONS = sim.CalibrationOptions(
     focal_sigma_px=3.0,
     centre_sigma_px=3.0,
     camera_rotation_sigma_deg=1.0,
@@ -51,7 +44,7 @@ DEVIATIONS = CalibrationOptions(
 )
 
 
-def _report_at_truth(scenario: Scenario) -> VIOptimizationReport:
+def _report_at_truth(scenario: sim.Scenario) -> VIOptimizationReport:
     data = simulate(scenario)
     report = optimize(true_map(data.maps[0], data.truth), AT_TRUTH)[1]
     assert report.observations_not_used == 0
@@ -66,7 +59,7 @@ def _chi_square(report: VIOptimizationReport) -> dict[str, float]:
     }
 
 
-def _cameras() -> dict[str, CameraOptions]:
+def _cameras() -> dict[str, sim.CameraOptions]:
     parameters: dict[str, tuple[float, ...]] = {
         "none": (),
         "radial-tangential": (-0.28, 0.07, 2e-4, 2e-5),
@@ -75,7 +68,7 @@ def _cameras() -> dict[str, CameraOptions]:
     }
     cameras = {}
     for distortion, values in parameters.items():
-        pinhole = CameraOptions(distortion=distortion, distortion_parameters=values)
+        pinhole = sim.CameraOptions(distortion=distortion, distortion_parameters=values)
         cameras[f"pinhole {distortion}"] = pinhole
         cameras[f"unified {distortion}"] = dataclasses.replace(
             pinhole,
@@ -119,7 +112,7 @@ def test_an_unknown_calibration_is_found_in_the_truth() -> None:
     assert skewed["inertial"] > 100.0 * inertial
 
 
-def _without_swaps(scenario: Scenario) -> Scenario:
+def _without_swaps(scenario: sim.Scenario) -> sim.Scenario:
     measurement = dataclasses.replace(scenario.measurement, identity_swap_share=0.0)
     return dataclasses.replace(scenario, measurement=measurement)
 
@@ -144,10 +137,10 @@ def test_all_residuals_of_a_long_session_have_the_announced_size() -> None:
 
 @pytest.mark.slow
 def test_inertial_errors_have_the_announced_size() -> None:
-    options = ImuOptions(gyro_bias_walk=0.0, accel_bias_walk=0.0)
+    options = sim.ImuOptions(gyro_bias_walk=0.0, accel_bias_walk=0.0)
     stride, seconds = 100, 1500
-    session = SessionOptions(duration_s=float(seconds), turns=40.0)
-    spline = motion_spline(session, WorldOptions(), np.random.default_rng(1))
+    session = sim.SessionOptions(duration_s=float(seconds), turns=40.0)
+    spline = motion_spline(session, sim.WorldOptions(), np.random.default_rng(1))
     motion = spline.evaluate(np.arange(seconds * 200 + 1) / 200.0)
     samples = [
         measure(opts, ImuIntrinsics(), motion, np.random.default_rng(2))

@@ -8,15 +8,9 @@ import pytest
 from maplab_py.sensors import Camera, CameraRig, Distortion, Projection
 from maplab_py.sensors.camera import CAMERA_MODELS
 from maplab_py.sensors.projection import project
+from maplab_py.simulation import scenario as sim
 from maplab_py.simulation.cameras import field_of_view_radius, pixels_of
 from maplab_py.simulation.detection import Detections, is_hidden
-from maplab_py.simulation.scenario import (
-    AppearanceOptions,
-    CameraOptions,
-    Scenario,
-    SessionOptions,
-    WorldOptions,
-)
 from maplab_py.simulation.scene import describe, make_appearance, make_session_appearance
 from maplab_py.simulation.simulate import simulate
 from maplab_py.simulation.truth import true_map
@@ -106,7 +100,7 @@ def test_field_of_view_ends_where_the_image_turns_back() -> None:
 
 def test_the_truth_of_a_session_holds_cameras_with_the_most_parameters() -> None:
     cameras = tuple(
-        CameraOptions(
+        sim.CameraOptions(
             projection=projection.value,
             distortion=distortion.value,
             intrinsics=(*MIRROR[projection], *PINHOLE),
@@ -118,7 +112,7 @@ def test_the_truth_of_a_session_holds_cameras_with_the_most_parameters() -> None
         )
     )
     scenario = dataclasses.replace(
-        Scenario(), sessions=(SessionOptions(duration_s=2.0),), cameras=cameras
+        sim.Scenario(), sessions=(sim.SessionOptions(duration_s=2.0),), cameras=cameras
     )
     data = simulate(scenario)
     rig = next(
@@ -154,7 +148,7 @@ def _distance(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def test_distances_grow_with_view_scale_and_session() -> None:
-    world = make_appearance(AppearanceOptions(), np.arange(COUNT), np.random.default_rng(0))
+    world = make_appearance(sim.AppearanceOptions(), np.arange(COUNT), np.random.default_rng(0))
     session = make_session_appearance(world, np.random.default_rng(1))
     other = make_session_appearance(world, np.random.default_rng(2))
     rng = np.random.default_rng(3)
@@ -174,7 +168,7 @@ def test_distances_grow_with_view_scale_and_session() -> None:
 
 
 def test_bits_are_correlated() -> None:
-    world = make_appearance(AppearanceOptions(), np.arange(COUNT), np.random.default_rng(0))
+    world = make_appearance(sim.AppearanceOptions(), np.arange(COUNT), np.random.default_rng(0))
     session = make_session_appearance(world, np.random.default_rng(1))
     found = describe(session, _detections([0, 0, 1], 3.0), np.random.default_rng(3))
     bits = np.unpackbits(found, axis=1).astype(np.float64)
@@ -186,14 +180,14 @@ def test_bits_are_correlated() -> None:
 
 def test_share_that_vanishes() -> None:
     world = make_appearance(
-        AppearanceOptions(vanish_share=0.3), np.arange(5000), np.random.default_rng(0)
+        sim.AppearanceOptions(vanish_share=0.3), np.arange(5000), np.random.default_rng(0)
     )
     session = make_session_appearance(world, np.random.default_rng(1))
     assert abs(np.mean(session.is_there) - 0.7) < 0.03
 
 
 def test_length_of_the_descriptor() -> None:
-    options = AppearanceOptions(descriptor_bytes=64)
+    options = sim.AppearanceOptions(descriptor_bytes=64)
     world = make_appearance(options, np.arange(COUNT), np.random.default_rng(0))
     session = make_session_appearance(world, np.random.default_rng(1))
     found = describe(session, _detections([0, 0, 1], 3.0), np.random.default_rng(3))
@@ -240,7 +234,7 @@ def test_distances_share_their_histograms_with_those_of_recorded_maps() -> None:
 
 @pytest.mark.parametrize("rooms", [1, 3])
 def test_landmarks_are_on_walls_or_furniture(rooms: int) -> None:
-    options = WorldOptions(rooms=rooms, landmarks_per_room=500)
+    options = sim.WorldOptions(rooms=rooms, landmarks_per_room=500)
     world = make_world(options, np.random.default_rng(0))
     size = np.array(options.room_size_m)
     local = world.p_G - np.array([size[0], 0, 0]) * np.round(world.p_G[:, :1] / size[0])
@@ -256,7 +250,7 @@ def test_landmarks_are_on_walls_or_furniture(rooms: int) -> None:
 
 
 def test_wall_normals_look_inwards() -> None:
-    world = make_world(WorldOptions(furniture_per_room=0), np.random.default_rng(0))
+    world = make_world(sim.WorldOptions(furniture_per_room=0), np.random.default_rng(0))
     middle = np.array([0.0, 0.0, 1.75])
     assert np.all(np.sum((middle - world.p_G) * world.normal_G, axis=1) > 0.0)
 
@@ -271,7 +265,7 @@ def test_a_box_hides_what_is_behind_and_nothing_else() -> None:
 
 
 def test_rooms_see_each_other_through_the_doorway_only() -> None:
-    options = WorldOptions(rooms=2, furniture_per_room=0)
+    options = sim.WorldOptions(rooms=2, furniture_per_room=0)
     world = make_world(options, np.random.default_rng(0))
     eye = np.array([[2.0, 0.0, 1.5], [2.0, 0.0, 1.5]])
     points = np.array([[8.0, 0.0, 1.5], [8.0, 3.9, 1.5]])
@@ -283,7 +277,7 @@ def test_rooms_see_each_other_through_the_doorway_only() -> None:
 
 
 def test_identical_rooms_share_their_looks_but_for_a_few_points() -> None:
-    options = WorldOptions(
+    options = sim.WorldOptions(
         rooms=3, landmarks_per_room=1000, identical_rooms=True, distinct_share=0.1
     )
     world = make_world(options, np.random.default_rng(0))
@@ -297,7 +291,7 @@ def test_identical_rooms_share_their_looks_but_for_a_few_points() -> None:
     np.testing.assert_allclose(np.ptp(places[:, 1:], axis=0), 0.0, atol=1e-12)
 
 
-CORRIDOR = WorldOptions(
+CORRIDOR = sim.WorldOptions(
     layout="corridor", floors=3, room_size_m=(20.0, 14.0, 3.0), landmarks_per_room=2000
 )
 
@@ -322,7 +316,7 @@ def test_floors_see_each_other_through_the_stairwell_only() -> None:
 
 
 def test_bare_surfaces_carry_few_landmarks() -> None:
-    options = WorldOptions(landmarks_per_room=4000, furniture_per_room=0, patchiness=0.0)
+    options = sim.WorldOptions(landmarks_per_room=4000, furniture_per_room=0, patchiness=0.0)
     even = make_world(options, np.random.default_rng(1))
     bare = make_world(dataclasses.replace(options, bare_share=0.5), np.random.default_rng(1))
 

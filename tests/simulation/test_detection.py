@@ -8,13 +8,8 @@ import pytest
 from maplab_py.geometry import se3
 from maplab_py.sensors.projection import project
 from maplab_py.simulation import detection
+from maplab_py.simulation import scenario as sim
 from maplab_py.simulation.detection import drifts
-from maplab_py.simulation.scenario import (
-    CameraOptions,
-    MeasurementOptions,
-    SessionOptions,
-    WorldOptions,
-)
 from maplab_py.simulation.simulate import SimulatedData, simulate
 from maplab_py.simulation.world import make_world
 from maplab_py.vimap.consistency import check_consistency
@@ -68,7 +63,9 @@ def test_coarse_octaves_are_found_near_by_and_are_less_exact() -> None:
 
 
 ROLLING = dataclasses.replace(
-    PERFECT, cameras=(CameraOptions(line_delay_s=4e-5),), sessions=(SessionOptions(duration_s=6.0),)
+    PERFECT,
+    cameras=(sim.CameraOptions(line_delay_s=4e-5),),
+    sessions=(sim.SessionOptions(duration_s=6.0),),
 )
 
 
@@ -109,11 +106,11 @@ def vi_map_rates(T_G_I: np.ndarray, time_s: np.ndarray) -> np.ndarray:
 
 MOVING = dataclasses.replace(
     PERFECT,
-    world=WorldOptions(landmarks_per_room=800, moving_objects=4, landmarks_per_object=150),
-    measurement=MeasurementOptions(
+    world=sim.WorldOptions(landmarks_per_room=800, moving_objects=4, landmarks_per_object=150),
+    measurement=sim.MeasurementOptions(
         frame_rate_hz=5.0, keypoint_sigma_px=0.0, identity_swap_share=0.0, clutter_share=0.0
     ),
-    sessions=(SessionOptions(duration_s=8.0, turns=0.3),),
+    sessions=(sim.SessionOptions(duration_s=8.0, turns=0.3),),
 )
 
 
@@ -154,10 +151,10 @@ def test_objects_stay_inside_and_keep_their_speed() -> None:
 def test_what_is_out_of_reach_is_left_out_without_a_difference(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    city = WorldOptions(
+    city = sim.WorldOptions(
         layout="city", blocks=(4, 1), room_size_m=(18.0, 14.0, 9.0), corridor_width_m=6.0
     )
-    walk = SessionOptions(kind="streets", duration_s=20.0, turns=0.2, last_block=(3, 0))
+    walk = sim.SessionOptions(kind="streets", duration_s=20.0, turns=0.2, last_block=(3, 0))
     scenario = dataclasses.replace(SMALL, world=city, sessions=(walk,))
     data = simulate(scenario)
     everywhere = np.full(3, -np.inf), np.full(3, np.inf)

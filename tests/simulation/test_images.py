@@ -16,19 +16,11 @@ from maplab_py.interop.imu_csv import read_imu_csv
 from maplab_py.interop.trajectories import read_trajectory
 from maplab_py.sensors import Camera, Distortion, Projection
 from maplab_py.sensors.projection import back_project
+from maplab_py.simulation import scenario as sim
 from maplab_py.simulation.cameras import pixels_of
 from maplab_py.simulation.imaging import Brightness, Imager, pixel_rays
 from maplab_py.simulation.raw_data import write_mesh, write_raw_data
 from maplab_py.simulation.ray_caster import RayCaster, painted_boxes
-from maplab_py.simulation.scenario import (
-    CalibrationOptions,
-    CameraOptions,
-    ImageOptions,
-    MeasurementOptions,
-    Scenario,
-    SessionOptions,
-    WorldOptions,
-)
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.scene import Scene, make_scene
 from maplab_py.simulation.shading_kernels import PaintedBoxes
@@ -55,7 +47,7 @@ def _scene(boxes: int, seed: int = 0) -> Scene:
     rng = np.random.default_rng(seed)
     middle, half = rng.uniform(ROOM[0], ROOM[1], (boxes, 3)), rng.uniform(0.05, 0.4, (boxes, 3))
     corners = np.stack([middle - half, middle + half], axis=1)
-    return make_scene(ROOM, corners, ImageOptions(texel_m=0.01), rng)
+    return make_scene(ROOM, corners, sim.ImageOptions(texel_m=0.01), rng)
 
 
 def _pose(yaw: float, pitch: float, roll: float, *position: float) -> np.ndarray:
@@ -178,18 +170,20 @@ def test_a_camera_in_an_impossible_place_reads_nothing_beyond_the_textures(
     assert np.all((known >= 0.0) & (known <= 255.0))
 
 
-SMALL_CAMERA = CameraOptions(
+SMALL_CAMERA = sim.CameraOptions(
     intrinsics=(190.0, 190.0, 188.0, 120.0), width_px=376, height_px=240, position_m=(0.05, 0.06, 0.0)
 )  # fmt: skip
-STEREO = Scenario(
-    world=WorldOptions(rooms=2, landmarks_per_room=1500),
+STEREO = sim.Scenario(
+    world=sim.WorldOptions(rooms=2, landmarks_per_room=1500),
     cameras=(SMALL_CAMERA, dataclasses.replace(SMALL_CAMERA, position_m=(0.05, -0.06, 0.0))),
-    measurement=MeasurementOptions(
+    measurement=sim.MeasurementOptions(
         frame_rate_hz=2.0, keypoint_sigma_px=0.0, clutter_share=0.0, identity_swap_share=0.0
     ),
-    calibration=CalibrationOptions(focal_sigma_px=3.0, camera_rotation_sigma_deg=1.0),
-    images=ImageOptions(render=True, blur_samples=1, noise_sigma=0.0, gain_swing=0.0, vignette=0.0),
-    sessions=(SessionOptions(kind="loop", duration_s=2.0, turns=0.05),),
+    calibration=sim.CalibrationOptions(focal_sigma_px=3.0, camera_rotation_sigma_deg=1.0),
+    images=sim.ImageOptions(
+        render=True, blur_samples=1, noise_sigma=0.0, gain_swing=0.0, vignette=0.0
+    ),
+    sessions=(sim.SessionOptions(kind="loop", duration_s=2.0, turns=0.05),),
 )
 
 
@@ -201,7 +195,7 @@ def data() -> SimulatedData:
 @cache
 def scene() -> Scene:
     world = data().world
-    options = ImageOptions(texel_m=0.01)
+    options = sim.ImageOptions(texel_m=0.01)
     return make_scene(world.bounds, world.boxes, options, np.random.default_rng(0))
 
 
@@ -328,10 +322,10 @@ def test_exposure_blur_vignette_and_noise() -> None:
 
 
 @cache
-def _raw_scenario() -> Scenario:
+def _raw_scenario() -> sim.Scenario:
     return dataclasses.replace(
         STEREO,
-        images=ImageOptions(render=True, texel_m=0.02, blur_samples=1),
+        images=sim.ImageOptions(render=True, texel_m=0.02, blur_samples=1),
         sessions=(dataclasses.replace(STEREO.sessions[0], duration_s=1.0, turns=0.02),),
     )
 

@@ -11,14 +11,8 @@ from maplab_py.geometry import se3, so3
 from maplab_py.geometry.interpolation import interpolate_poses
 from maplab_py.interop.ply import parse_ply
 from maplab_py.interop.wheel_odometry import read_wheel_odometry
+from maplab_py.simulation import scenario as sim
 from maplab_py.simulation.raw_data import write_raw_data
-from maplab_py.simulation.scenario import (
-    LidarOptions,
-    OtherSensorOptions,
-    Scenario,
-    SessionOptions,
-    WorldOptions,
-)
 from maplab_py.simulation.scenario_file import check_scenario, load_scenario
 from maplab_py.simulation.simulate import Lidar, SimulatedData, simulate
 from maplab_py.simulation.truth import Truth
@@ -30,14 +24,14 @@ from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.ids import from_hex, to_hex
 from tests.simulation.small import SMALL, simulated
 
-OPTIONS = OtherSensorOptions(
+OPTIONS = sim.OtherSensorOptions(
     absolute_pose_every_s=0.2, odometry=True, wheel_odometry=True, loop_edges=40,
     loop_edge_false_share=0.25, loop_edge_min_gap_s=8.0, loop_edge_max_distance_m=1.5,
 )  # fmt: skip
 SCENARIO = dataclasses.replace(
     SMALL,
     other_sensors=OPTIONS,
-    sessions=(SessionOptions(duration_s=40.0, turns=2.0),),
+    sessions=(sim.SessionOptions(duration_s=40.0, turns=2.0),),
 )
 
 
@@ -107,7 +101,7 @@ def test_true_loop_edges_are_true_and_false_ones_are_not(data: SimulatedData) ->
 
 
 def test_other_sensors_leave_the_other_measurements_alone(data: SimulatedData) -> None:
-    plain = simulate(dataclasses.replace(SCENARIO, other_sensors=OtherSensorOptions())).maps[0]
+    plain = simulate(dataclasses.replace(SCENARIO, other_sensors=sim.OtherSensorOptions())).maps[0]
     np.testing.assert_array_equal(plain.keypoints.uv_px, data.maps[0].keypoints.uv_px)
     np.testing.assert_array_equal(plain.imu_samples.accel_gyro, data.maps[0].imu_samples.accel_gyro)
     assert len(simulated().maps[0].loop_closure_edges) == 0
@@ -126,7 +120,7 @@ def test_the_scenario_of_false_edges() -> None:
 
 
 def test_raw_data_have_the_velocities_of_the_wheels(tmp_path: Path) -> None:
-    options = OtherSensorOptions(
+    options = sim.OtherSensorOptions(
         wheel_odometry=True,
         wheel_scale=1.5,
         wheel_position_m=(-0.2, 0.1, -0.3),
@@ -138,7 +132,7 @@ def test_raw_data_have_the_velocities_of_the_wheels(tmp_path: Path) -> None:
         SMALL,
         world=dataclasses.replace(SMALL.world, rooms=2),
         other_sensors=options,
-        sessions=(SessionOptions(kind="vehicle", duration_s=8.0, turns=0.2),),
+        sessions=(sim.SessionOptions(kind="vehicle", duration_s=8.0, turns=0.2),),
     )
     data = simulate(scenario)
     (folder,) = write_raw_data(scenario, data, tmp_path)
@@ -157,7 +151,7 @@ def test_raw_data_have_the_velocities_of_the_wheels(tmp_path: Path) -> None:
     )
 
 
-EXACT = LidarOptions(rate_hz=2.0, rings=8, columns=90, range_sigma_m=0.0)
+EXACT = sim.LidarOptions(rate_hz=2.0, rings=8, columns=90, range_sigma_m=0.0)
 
 
 def distance_to_surfaces(world: World, p_G: np.ndarray) -> np.ndarray:
@@ -174,7 +168,7 @@ def distance_to_surfaces(world: World, p_G: np.ndarray) -> np.ndarray:
 
 def test_points_lie_on_the_surfaces_all_around() -> None:
     rng = np.random.default_rng(1)
-    world = make_world(WorldOptions(landmarks_per_room=100), rng)
+    world = make_world(sim.WorldOptions(landmarks_per_room=100), rng)
     lidar = Lidar.of(world, EXACT, rng)
     T_G_L = se3.make(so3.exp([0.1, -0.2, 0.7]), np.array([0.5, -0.4, 1.4]))
     cloud = lidar.scan(T_G_L, rng)
@@ -188,7 +182,7 @@ def test_points_lie_on_the_surfaces_all_around() -> None:
 
 def test_noise_lies_along_the_rays_and_ranges_are_limited() -> None:
     rng = np.random.default_rng(1)
-    world = make_world(WorldOptions(landmarks_per_room=100), rng)
+    world = make_world(sim.WorldOptions(landmarks_per_room=100), rng)
     T_G_L = se3.make(so3.exp([0.0, 0.0, 0.0]), np.array([0.5, -0.4, 1.4]))
     exact = Lidar.of(world, EXACT, rng).scan(T_G_L, rng)
     noisy = Lidar.of(world, dataclasses.replace(EXACT, range_sigma_m=0.02), rng).scan(T_G_L, rng)
@@ -211,7 +205,7 @@ def test_a_map_gets_clouds_of_a_mounted_sensor() -> None:
     np.testing.assert_array_equal(
         vi_map.missions.sensor_id[0, MissionSensor.LIDAR], table.sensor_id[0]
     )
-    plain = simulate(dataclasses.replace(scenario, lidar=LidarOptions())).maps[0]
+    plain = simulate(dataclasses.replace(scenario, lidar=sim.LidarOptions())).maps[0]
     np.testing.assert_array_equal(plain.vertices.T_M_I, vi_map.vertices.T_M_I)
     assert not len(plain.resources)
     _check_clouds_against_truth(data.world, vi_map, truth)
@@ -237,12 +231,12 @@ def _check_clouds_against_truth(world: World, vi_map, truth: Truth) -> None:
 @pytest.mark.parametrize(
     ("options", "key"),
     [
-        (LidarOptions(rate_hz=-1.0), "rate_hz"),
-        (LidarOptions(rings=1), "rings"),
-        (LidarOptions(lowest_deg=20.0, highest_deg=-20.0), "lowest_deg"),
-        (LidarOptions(min_range_m=5.0, max_range_m=4.0), "max_range_m"),
+        (sim.LidarOptions(rate_hz=-1.0), "rate_hz"),
+        (sim.LidarOptions(rings=1), "rings"),
+        (sim.LidarOptions(lowest_deg=20.0, highest_deg=-20.0), "lowest_deg"),
+        (sim.LidarOptions(min_range_m=5.0, max_range_m=4.0), "max_range_m"),
     ],
 )
-def test_wrong_options_are_refused(options: LidarOptions, key: str) -> None:
+def test_wrong_options_are_refused(options: sim.LidarOptions, key: str) -> None:
     with pytest.raises(UserError, match=key):
-        check_scenario(Scenario(lidar=options))
+        check_scenario(sim.Scenario(lidar=options))

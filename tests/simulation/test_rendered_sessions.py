@@ -14,31 +14,25 @@ from maplab_py.interop.recordings.protocol import FrameSet, ImuBatch
 from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.interop.trajectories import read_trajectory
+from maplab_py.simulation import scenario as sim
 from maplab_py.simulation.imaging import Brightness, make_brightness
 from maplab_py.simulation.raw_data import SessionFolders, write_images, write_raw_data
 from maplab_py.simulation.ray_caster import painted_boxes
-from maplab_py.simulation.scenario import (
-    CameraOptions,
-    ImageOptions,
-    MeasurementOptions,
-    Scenario,
-    SessionImages,
-    SessionOptions,
-    WorldOptions,
-)
 from maplab_py.simulation.scenario_file import load_scenario, parse_scenario, scenario_names
 from maplab_py.simulation.scene import Scene, make_scene
 from maplab_py.simulation.simulate import SimulatedData, simulate
 
-CAMERA = CameraOptions(
+CAMERA = sim.CameraOptions(
     intrinsics=(95.0, 95.0, 94.0, 60.0), width_px=188, height_px=120, position_m=(0.05, 0.06, 0.0)
 )
-FLIGHT = Scenario(
-    world=WorldOptions(landmarks_per_room=600),
+FLIGHT = sim.Scenario(
+    world=sim.WorldOptions(landmarks_per_room=600),
     cameras=(CAMERA, dataclasses.replace(CAMERA, position_m=(0.05, -0.06, 0.0))),
-    measurement=MeasurementOptions(frame_rate_hz=5.0),
-    images=ImageOptions(render=True, texel_m=0.02, gain_swing=0.0, vignette=0.0, noise_sigma=0.0),
-    sessions=(SessionOptions(kind="loop", duration_s=1.0, turns=0.03),),
+    measurement=sim.MeasurementOptions(frame_rate_hz=5.0),
+    images=sim.ImageOptions(
+        render=True, texel_m=0.02, gain_swing=0.0, vignette=0.0, noise_sigma=0.0
+    ),
+    sessions=(sim.SessionOptions(kind="loop", duration_s=1.0, turns=0.03),),
 )
 ROOM = np.array([[-4.0, -3.0, 0.0], [4.0, 3.0, 3.0]])
 FLIGHTS = ("flight_dark", "flight_easy", "flight_fast", "flight_stop_and_go", "turn_on_the_spot")
@@ -51,7 +45,7 @@ def data() -> SimulatedData:
 
 def _scene(**options: float) -> Scene:
     boxes = np.array([[[1.0, 1.0, 0.0], [2.0, 2.0, 2.0]]])
-    image_options = ImageOptions(texel_m=0.02, **options)  # type: ignore[arg-type]
+    image_options = sim.ImageOptions(texel_m=0.02, **options)  # type: ignore[arg-type]
     return make_scene(ROOM, boxes, image_options, np.random.default_rng(1))
 
 
@@ -59,7 +53,7 @@ def _first_images(folder: Path, **images: float) -> list[np.ndarray]:
     """Render a session with its own light or paint; return the images of the left camera."""
     session = dataclasses.replace(
         FLIGHT.sessions[0],
-        images=SessionImages(**images),  # type: ignore[arg-type]
+        images=sim.SessionImages(**images),  # type: ignore[arg-type]
     )
     scenario = dataclasses.replace(FLIGHT, sessions=(session,))
     write_raw_data(scenario, data(), folder)
@@ -78,7 +72,7 @@ def test_light_multiplies_grey_values(tmp_path: Path) -> None:
 
 
 def test_the_gain_jumps_at_random_times_and_stays_in_between() -> None:
-    options = SessionImages(gain_jump=0.4, gain_jump_every_s=2.0)
+    options = sim.SessionImages(gain_jump=0.4, gain_jump_every_s=2.0)
     brightness = make_brightness(options, 0.0, 400.0, np.random.default_rng(3))
     assert 150 < len(brightness.jump_s) < 250
     times = np.linspace(0.0, 400.0, 20_001)
@@ -97,7 +91,7 @@ def test_both_cameras_have_the_same_gain_at_a_time() -> None:
 
 def test_without_jumps_the_gain_is_constant() -> None:
     random = np.random.default_rng(0)
-    brightness = make_brightness(SessionImages(light=0.7), 0.0, 60.0, random)
+    brightness = make_brightness(sim.SessionImages(light=0.7), 0.0, 60.0, random)
     assert {brightness.at(time) for time in np.linspace(0.0, 60.0, 100)} == {0.7}
 
 
@@ -150,7 +144,7 @@ def test_bare_surfaces_have_hardly_any_corners() -> None:
 
 def test_a_share_of_the_surfaces_is_bare() -> None:
     boxes = np.tile(np.array([[[1.0, 1.0, 0.0], [1.2, 1.2, 0.2]]]), (60, 1, 1))
-    options = ImageOptions(texel_m=0.1, bare_share=0.3)
+    options = sim.ImageOptions(texel_m=0.1, bare_share=0.3)
     scene = make_scene(ROOM, boxes, options, np.random.default_rng(0))
     assert scene.textures.is_bare.mean() == pytest.approx(0.3, abs=0.07)
 

@@ -13,20 +13,9 @@ from maplab_py.cancellation import CancelToken, obeying
 from maplab_py.console.session.session import Session
 from maplab_py.errors import Cancelled, MapError, UserError
 from maplab_py.storage.native import load_map, save_map
-from maplab_py.storage.resources.files import (
-    missing_files,
-    orphaned_files,
-    remove_files,
-    with_file_checks,
-    with_merged_folders,
-)
+from maplab_py.storage.resources import files as resource_files
+from maplab_py.storage.resources import store as resource_store
 from maplab_py.storage.resources.new import NewResources
-from maplab_py.storage.resources.store import (
-    ResourceCache,
-    ResourceStore,
-    relative_path,
-    resource_path,
-)
 from maplab_py.storage.resources.types import RESOURCE_TYPES, resource_type, resource_type_of
 from maplab_py.vimap import ResourceOwner, VIMap
 from maplab_py.vimap.consistency import check_consistency
@@ -82,30 +71,30 @@ def test_every_type_is_saved_and_reloaded(plain: VIMap, tmp_path: Path, is_exter
     table = loaded.resources
     assert len(table) == len(OWNERS) * len(RESOURCE_TYPES)
     for row, kind in enumerate(table.type.tolist()):
-        path = resource_path(loaded, row, tmp_path / "map")
+        path = resource_store.resource_path(loaded, row, tmp_path / "map")
         assert path.read_bytes() == content_of(kind)
         assert path.is_relative_to(outside if is_external else tmp_path / "map")
     sensors = table.owner_kind == ResourceOwner.SENSOR
     np.testing.assert_array_equal(np.sort(table.timestamp_ns[sensors]), np.arange(25))
-    assert missing_files(loaded, tmp_path / "map") == []
-    assert orphaned_files((), loaded, tmp_path / "map") == []
+    assert resource_files.missing_files(loaded, tmp_path / "map") == []
+    assert resource_files.orphaned_files((), loaded, tmp_path / "map") == []
 
 
 def test_missing_and_orphaned_files_are_named(plain: VIMap, tmp_path: Path) -> None:
     folder = tmp_path / "map"
     save_map(with_every_type(plain), folder)
     loaded, _ = load_map(folder)
-    missing = resource_path(loaded, 0, folder)
+    missing = resource_store.resource_path(loaded, 0, folder)
     missing.unlink()
     orphan = folder / "resources" / "text" / "note.txt"
     orphan.write_text("left over")
-    report = with_file_checks(check_consistency(loaded), loaded, folder)
+    report = resource_files.with_file_checks(check_consistency(loaded), loaded, folder)
     assert [(e.rule, e.where) for e in report.errors] == [
         ("resource whose file is missing", (str(missing),))
     ]
     assert report.warnings[-1].where == (str(orphan.resolve()),)
     assert "missing" in report.failure
-    homeless = with_file_checks(check_consistency(loaded), loaded, None)
+    homeless = resource_files.with_file_checks(check_consistency(loaded), loaded, None)
     assert homeless.errors[0].count == len(loaded.resources)
 
 
@@ -115,7 +104,7 @@ def test_removed_resources_leave_orphans_that_can_be_deleted(plain: VIMap, tmp_p
     loaded, _ = load_map(folder)
     fewer = without_resources(loaded, resources_of(loaded, (0, 16)))
     assert len(fewer.resources) == len(loaded.resources) - 6
-    orphans = orphaned_files((), fewer, folder)
+    orphans = resource_files.orphaned_files((), fewer, folder)
     assert {path.parent.name for path in orphans} == {"raw_images", "point_cloud"}
     other = loaded.replace(
         metadata=dataclasses.replace(
@@ -123,10 +112,10 @@ def test_removed_resources_leave_orphans_that_can_be_deleted(plain: VIMap, tmp_p
         ),
         resources=loaded.resources.replace(folder=np.zeros(len(loaded.resources), dtype=np.int32)),
     )
-    assert orphaned_files((other,), fewer, folder) == []
-    assert remove_files(orphans) == (6, [])
-    assert orphaned_files((), fewer, folder) == []
-    assert missing_files(fewer, folder) == []
+    assert resource_files.orphaned_files((other,), fewer, folder) == []
+    assert resource_files.remove_files(orphans) == (6, [])
+    assert resource_files.orphaned_files((), fewer, folder) == []
+    assert resource_files.missing_files(fewer, folder) == []
 
 
 def test_a_cancelled_clean_up_stops(tmp_path: Path) -> None:
@@ -135,12 +124,12 @@ def test_a_cancelled_clean_up_stops(tmp_path: Path) -> None:
     token = CancelToken()
     token.cancelled = True
     with obeying(token), pytest.raises(Cancelled):
-        remove_files([file])
+        resource_files.remove_files([file])
     assert file.exists()
 
 
 def test_files_that_cannot_be_deleted_are_named(tmp_path: Path) -> None:
-    removed, problems = remove_files([tmp_path])
+    removed, problems = resource_files.remove_files([tmp_path])
     assert removed == 0
     assert str(tmp_path) in problems[0]
 
@@ -164,12 +153,12 @@ def test_equal_folders_are_merged(plain: VIMap, tmp_path: Path) -> None:
             vi_map.metadata, external_resource_folders=names, resource_folder_in_use=4
         ),
     )
-    merged, dropped = with_merged_folders(vi_map, tmp_path / "map")
+    merged, dropped = resource_files.with_merged_folders(vi_map, tmp_path / "map")
     assert dropped == [names[1], names[2], names[3]]
     assert merged.metadata.external_resource_folders == (names[0], names[4])
     assert merged.metadata.resource_folder_in_use == 1
     np.testing.assert_array_equal(merged.resources.folder[:6], [0, 0, -1, 0, 1, -1])
-    again, nothing = with_merged_folders(merged, tmp_path / "map")
+    again, nothing = resource_files.with_merged_folders(merged, tmp_path / "map")
     assert again is merged
     assert nothing == []
 
@@ -191,7 +180,7 @@ def test_types_are_named_by_number_or_folder() -> None:
 def test_the_cache_counts_by_type_and_sees_changes(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.write_bytes(b"one")
-    cache = ResourceCache(max_bytes=10)
+    cache = resource_store.ResourceCache(max_bytes=10)
 
     def read(path: Path) -> tuple[bytes, int]:
         data = path.read_bytes()
@@ -226,7 +215,7 @@ def folder(tmp_path: Path) -> Path:
     folder = tmp_path / "map"
     save_map(vi_map, folder)
     for row in range(COUNT):
-        path = folder / "resources" / relative_path(vi_map, row)
+        path = folder / "resources" / resource_store.relative_path(vi_map, row)
         path.parent.mkdir(parents=True, exist_ok=True)
         image = b"P5 3 2 255\n" + bytes(range(6))
         path.write_bytes(image if row == COUNT - 1 else b"text %d" % row)
@@ -234,7 +223,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def contents(vi_map: VIMap, folder: Path) -> list[bytes]:
-    return [resource_path(vi_map, row, folder).read_bytes() for row in range(COUNT)]
+    return [resource_store.resource_path(vi_map, row, folder).read_bytes() for row in range(COUNT)]
 
 
 def test_there_are_the_formats_types() -> None:
@@ -248,7 +237,7 @@ def test_store_loads_and_stays_within_its_bound(folder: Path) -> None:
     vi_map, _ = load_map(folder)
     assert sorted(vi_map.resources.type) == [0, 11, 11, 11]
     rows = {int(vi_map.resources.type[row]): row for row in range(COUNT)}
-    store = ResourceStore(vi_map, folder, max_bytes=13)
+    store = resource_store.ResourceStore(vi_map, folder, max_bytes=13)
     np.testing.assert_array_equal(store.load(rows[0]), [[0, 1, 2], [3, 4, 5]])
     texts = [row for row in range(COUNT) if row != rows[0]]
     assert sorted(store.load(row) for row in texts) == ["text 0", "text 1", "text 2"]
@@ -256,9 +245,9 @@ def test_store_loads_and_stays_within_its_bound(folder: Path) -> None:
     assert store.statistics.hits == 1
     assert store.statistics.misses == 4
     assert store.statistics.bytes <= 13
-    resource_path(vi_map, texts[0], folder).unlink()
+    resource_store.resource_path(vi_map, texts[0], folder).unlink()
     with pytest.raises(MapError, match="cannot be read"):
-        ResourceStore(vi_map, folder).load(texts[0])
+        resource_store.ResourceStore(vi_map, folder).load(texts[0])
 
 
 def test_resources_come_along(folder: Path, tmp_path: Path) -> None:
@@ -321,7 +310,7 @@ def with_images(vi_map: VIMap, temporary: Path, seed: bytes = b"") -> VIMap:
 
 
 def images_of(vi_map: VIMap, folder: Path) -> list[np.ndarray]:
-    store = ResourceStore(vi_map, folder)
+    store = resource_store.ResourceStore(vi_map, folder)
     rows = np.argsort(vi_map.resources.owner, kind="stable").tolist()
     return [store.load(row) for row in rows]
 

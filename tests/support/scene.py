@@ -16,19 +16,8 @@ from maplab_py.sensors import Camera, CameraRig, Distortion, Imu, ImuIntrinsics,
 from maplab_py.sensors.camera import CAMERA_MODELS
 from maplab_py.sensors.projection import is_inside_image, project
 from maplab_py.sensors.sensor_set import Extrinsics, SensorSet
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import VIMap, tables
 from maplab_py.vimap.ids import from_hex, random_ids, to_hex
-from maplab_py.vimap.tables import (
-    BaseFrames,
-    Frames,
-    ImuEdges,
-    ImuSamples,
-    Keypoints,
-    Landmarks,
-    Missions,
-    MissionSensor,
-    Vertices,
-)
 from tests.support.imu_model import distort_imu
 
 F64 = NDArray[np.float64]
@@ -83,25 +72,25 @@ class Scene:
         mission = np.repeat(np.arange(self.missions), self.vertices)
         T_G_I = np.concatenate([walk.T_G_I for walk in walks])
         frames, keypoints, landmarks = _images(self, rig, T_G_I, rng)
-        sensor_id = np.zeros((self.missions, len(MissionSensor), 2), dtype=np.uint64)
-        sensor_id[:, MissionSensor.IMU] = from_hex(imu.id)
-        sensor_id[:, MissionSensor.NCAMERA] = from_hex(rig.id)
+        sensor_id = np.zeros((self.missions, len(tables.MissionSensor), 2), dtype=np.uint64)
+        sensor_id[:, tables.MissionSensor.IMU] = from_hex(imu.id)
+        sensor_id[:, tables.MissionSensor.NCAMERA] = from_hex(rig.id)
         count = len(T_G_I)
         edges, samples = _imu_tables(self, walks, rng)
         q_M_G = so3.inverse(T_G_M[mission, :4])
         return VIMap(
             sensors=sensors,
-            missions=Missions.filled(
+            missions=tables.Missions.filled(
                 self.missions,
                 id=random_ids(self.missions, rng),
                 baseframe=np.arange(self.missions),
                 root_vertex=np.arange(self.missions) * self.vertices,
                 sensor_id=sensor_id,
             ),
-            baseframes=BaseFrames.filled(
+            baseframes=tables.BaseFrames.filled(
                 self.missions, id=random_ids(self.missions, rng), T_G_M=T_G_M
             ),
-            vertices=Vertices.filled(
+            vertices=tables.Vertices.filled(
                 count,
                 id=random_ids(count, rng),
                 mission=mission,
@@ -199,20 +188,20 @@ def _bias_walk(scene: Scene, density: float, count: int, rng: np.random.Generato
 
 def _imu_tables(
     scene: Scene, walks: list[_Walk], rng: np.random.Generator
-) -> tuple[ImuEdges, ImuSamples]:
+) -> tuple[tables.ImuEdges, tables.ImuSamples]:
     """Cut the recordings at the vertices; neighbouring edges share a sample."""
     per_edge = round(scene.interval_s * scene.rate_hz)
     begin = np.arange(scene.vertices - 1)
     rows = (begin[:, None] * per_edge + np.arange(per_edge + 1)).reshape(-1)
     first = (np.arange(scene.missions)[:, None] * scene.vertices + begin).reshape(-1)
-    edges = ImuEdges.filled(
+    edges = tables.ImuEdges.filled(
         len(first),
         id=random_ids(len(first), rng),
         from_vertex=first,
         to_vertex=first + 1,
         sample_count=np.full(len(first), per_edge + 1),
     )
-    return edges, ImuSamples.filled(
+    return edges, tables.ImuSamples.filled(
         len(rows) * len(walks),
         timestamp_ns=np.concatenate([walk.time_ns[rows] for walk in walks]),
         accel_gyro=np.concatenate([walk.accel_gyro[rows] for walk in walks]),
@@ -221,7 +210,7 @@ def _imu_tables(
 
 def _images(
     scene: Scene, rig: CameraRig, T_G_I: F64, rng: np.random.Generator
-) -> tuple[Frames, Keypoints, Landmarks]:
+) -> tuple[tables.Frames, tables.Keypoints, tables.Landmarks]:
     """Show every vertex the landmarks in its cameras' views; those seen twice become part."""
     direction = rng.normal(size=(scene.landmarks, 3)) * [1.0, 1.0, 0.45]
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -242,20 +231,20 @@ def _images(
     home = np.argmax(seen.any(axis=1)[:, kept], axis=0)
     sigma = np.full(len(vertex), 0.8)
     noise = scene.noise * sigma[:, None] * rng.standard_normal((len(vertex), 2))
-    frames = Frames.filled(
+    frames = tables.Frames.filled(
         vertices * cameras,
         id=random_ids(vertices * cameras, rng),
         vertex=np.repeat(np.arange(vertices), cameras),
         camera_index=np.tile(np.arange(cameras), vertices),
         keypoint_count=seen.sum(axis=2).reshape(-1),
     )
-    keypoints = Keypoints.filled(
+    keypoints = tables.Keypoints.filled(
         len(vertex),
         uv_px=uv[vertex, camera_row, landmark] + noise,
         sigma_px=sigma,
         landmark=row_of_landmark[landmark],
     )
-    landmarks = Landmarks.filled(
+    landmarks = tables.Landmarks.filled(
         len(kept),
         id=random_ids(len(kept), rng),
         vertex=home,

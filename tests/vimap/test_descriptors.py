@@ -18,20 +18,13 @@ from maplab_py.algorithms.sparsification.sparsify import descriptor_deviations, 
 from maplab_py.errors import EstimationError
 from maplab_py.interop.csv_dataset import CsvExportOptions, export_csv_dataset
 from maplab_py.storage.native import load_map, save_map
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import VIMap, edits
 from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.descriptors import (
     DescriptorBlock,
     binary_blocks,
     no_blocks,
     types_of,
-)
-from maplab_py.vimap.edits import (
-    merge_landmarks,
-    remove_landmarks,
-    remove_missions,
-    remove_observations,
-    remove_vertices,
 )
 from maplab_py.vimap.merge import merge_maps
 from maplab_py.vimap.table import object_column
@@ -93,14 +86,14 @@ def check_marks(vi_map: VIMap, described: Described, *, frames: int) -> None:
 
 EDITS: dict[str, Callable[[VIMap], VIMap]] = {
     "keyframing": lambda m: keyframe(m, KeyframingOptions(every_nth_vertex=3))[0],
-    "vertex removal": lambda m: remove_vertices(m, np.arange(1, 8)),
-    "landmark removal": lambda m: remove_landmarks(m, np.arange(0, 300, 3)),
-    "landmark merging": lambda m: merge_landmarks(m, np.arange(20), np.arange(20, 40)),
-    "observation removal": lambda m: remove_observations(m, m.observations[::7]),
+    "vertex removal": lambda m: edits.remove_vertices(m, np.arange(1, 8)),
+    "landmark removal": lambda m: edits.remove_landmarks(m, np.arange(0, 300, 3)),
+    "landmark merging": lambda m: edits.merge_landmarks(m, np.arange(20), np.arange(20, 40)),
+    "observation removal": lambda m: edits.remove_observations(m, m.observations[::7]),
     "sparsification": lambda m: sparsify(m, 100, SparsificationOptions())[0],
     "merging after": lambda m: merge_maps(m, walk_map())[0],
     "merging before": lambda m: merge_maps(walk_map(), m)[0],
-    "mission removal": lambda m: remove_missions(merge_maps(walk_map(), m)[0], [0]),
+    "mission removal": lambda m: edits.remove_missions(merge_maps(walk_map(), m)[0], [0]),
 }
 
 
@@ -233,7 +226,7 @@ def test_landmarks_are_scored_by_their_binary_descriptors() -> None:
 
 def test_tracks_of_one_type_become_landmarks_of_that_type() -> None:
     m = walk_map()
-    bare = remove_landmarks(m, np.arange(len(m.landmarks)))
+    bare = edits.remove_landmarks(m, np.arange(len(m.landmarks)))
     typed, report = init_tracks(with_blocks(bare, (8, 0, 0), (4, 5, 1)), LandmarkQualityOptions())
     assert report.landmarks_added > 0
     assert set(typed.landmarks.feature_type) == {0, 1}

@@ -9,10 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from maplab_py.algorithms.external_poses.alignment import (
-    robust_yaw_position,
-    with_aligned_base_frame,
-)
+from maplab_py.algorithms.external_poses import alignment
 from maplab_py.array_types import F64, I32, I64, U64, Mask
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3
@@ -67,7 +64,7 @@ def anchor_by_absolute_poses(
         if reason:
             refused[mission] = reason
             continue
-        vi_map, _ = with_aligned_base_frame(vi_map, mission, T_G_M)
+        vi_map, _ = alignment.with_aligned_base_frame(vi_map, mission, T_G_M)
         anchored[mission] = True
     return AbsoluteAnchoring(vi_map, anchored, refused)
 
@@ -84,7 +81,7 @@ def _alignment(
     table = vi_map.absolute_poses.take(rows)
     T_M_S = _T_M_S(vi_map, mission, table.vertex, table.sensor_id)
     try:
-        T_G_M = robust_yaw_position(table.T_G_S[:, 4:], T_M_S[:, 4:])
+        T_G_M = alignment.robust_yaw_position(table.T_G_S[:, 4:], T_M_S[:, 4:])
     except EstimationError as error:
         return se3.identity(), f"absolute poses: {error}"
     agrees = _agreeing(table.T_G_S, se3.compose(T_G_M, T_M_S), table.covariance, options)

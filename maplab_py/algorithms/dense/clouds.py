@@ -6,13 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from maplab_py.algorithms.dense.resources import (
-    CLOUDS,
-    COLOUR_CLOUDS,
-    DEPTH_MAPS,
-    FrameImages,
-    FrameResources,
-)
+from maplab_py.algorithms.dense import resources as frame_resources
 from maplab_py.array_types import F32, F64, U8
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.ply import PlyCloud, encode_ply
@@ -86,8 +80,8 @@ def convert_depth_maps(
         UserError: The map has no depth maps.
         MapError: A file is missing or damaged.
     """
-    resources = FrameResources(vi_map, map_folder)
-    rows = np.flatnonzero(resources_of(vi_map, DEPTH_MAPS))
+    resources = frame_resources.FrameResources(vi_map, map_folder)
+    rows = np.flatnonzero(resources_of(vi_map, frame_resources.DEPTH_MAPS))
     if not len(rows):
         raise UserError(
             "the map has no depth maps: stereo_dense_reconstruction makes some",
@@ -98,10 +92,11 @@ def convert_depth_maps(
     had = np.isin(
         vi_map.resources.owner[rows],
         vi_map.resources.owner[
-            resources_of(vi_map, CLOUDS) & (vi_map.resources.owner_kind == ResourceOwner.FRAME)
+            resources_of(vi_map, frame_resources.CLOUDS)
+            & (vi_map.resources.owner_kind == ResourceOwner.FRAME)
         ],
     )
-    images = FrameImages(vi_map, map_folder)
+    images = frame_resources.FrameImages(vi_map, map_folder)
     makers: dict[str, CloudMaker] = {}
     new = NewResources(seed=b"clouds")
     owners, points, coloured = [], 0, 0
@@ -112,7 +107,7 @@ def convert_depth_maps(
         maker = makers.setdefault(camera.id, CloudMaker(camera))
         image = images.image(frame)
         cloud = maker.cloud(resources.depth(row), image)
-        kind = COLOUR_CLOUDS if image is not None else CLOUDS[0]
+        kind = frame_resources.COLOUR_CLOUDS if image is not None else frame_resources.CLOUDS[0]
         new.add(kind, b"".join(encode_ply(cloud)))
         owners.append(frame)
         points += len(cloud.p)

@@ -9,13 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from maplab_py.algorithms.dense.pinhole import (
-    ImageMap,
-    Pinhole,
-    inscribed,
-    map_to_camera,
-    undistorted,
-)
+from maplab_py.algorithms.dense import pinhole as pinholes
 from maplab_py.algorithms.dense.resources import IMAGES, FrameImages, FrameResources, check_size
 from maplab_py.algorithms.landmarks.quality import evaluate_unknown_quality
 from maplab_py.array_types import F64, I64, U8
@@ -259,7 +253,7 @@ class UndistortedViews:
             of_frame.append(rows[camera.id])
         self.camera_of_view = np.array(of_frame, dtype=np.int64)
         made = [perspective(camera, options) for camera in self.cameras]
-        self.pinholes: list[Pinhole] = [pinhole for pinhole, _ in made]
+        self.pinholes: list[pinholes.Pinhole] = [pinhole for pinhole, _ in made]
         self._maps = [image_map for _, image_map in made]
         self.T_C_G = se3.inverse(np.stack([self._resources.T_G_C(f) for f in self.frames.tolist()]))
 
@@ -318,13 +312,15 @@ class UndistortedViews:
         return result, inside
 
 
-def perspective(camera: Camera, options: UndistortionOptions) -> tuple[Pinhole, ImageMap]:
+def perspective(
+    camera: Camera, options: UndistortionOptions
+) -> tuple[pinholes.Pinhole, pinholes.ImageMap]:
     """Return a perspective camera on the axis of a camera, and where its pixels lie in the recorded image.
 
     Between alpha = 0 (no pixel without image) and 1 (all of the image) the borders move linearly.
     """
-    inner = inscribed([(camera, np.eye(3))], camera.width_px, camera.height_px)
-    outer, _ = undistorted(camera)
+    inner = pinholes.inscribed([(camera, np.eye(3))], camera.width_px, camera.height_px)
+    outer, _ = pinholes.undistorted(camera)
     low, high = (
         (1.0 - options.alpha) * a + options.alpha * b
         for a, b in zip(_borders(inner), _borders(outer), strict=True)
@@ -336,11 +332,11 @@ def perspective(camera: Camera, options: UndistortionOptions) -> tuple[Pinhole, 
     focal = scale * inner.focal_px
     width, height = (np.floor(focal * (high - low) + 1e-6) + 1.0).astype(int).tolist()
     centre = -focal * low
-    pinhole = Pinhole(focal, (float(centre[0]), float(centre[1])), width, height)
-    return pinhole, map_to_camera(pinhole, camera, np.eye(3))
+    pinhole = pinholes.Pinhole(focal, (float(centre[0]), float(centre[1])), width, height)
+    return pinhole, pinholes.map_to_camera(pinhole, camera, np.eye(3))
 
 
-def _borders(pinhole: Pinhole) -> tuple[F64, F64]:
+def _borders(pinhole: pinholes.Pinhole) -> tuple[F64, F64]:
     """Return the points on the plane z = 1 of the first and of the last pixel."""
     centre = np.array(pinhole.centre_px)
     size = np.array([pinhole.width_px - 1.0, pinhole.height_px - 1.0])

@@ -9,13 +9,7 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.algorithms.dense.pinhole import (
-    ImageMap,
-    Pinhole,
-    inscribed,
-    map_from_camera,
-    map_to_camera,
-)
+from maplab_py.algorithms.dense import pinhole as pinholes
 from maplab_py.array_types import F32, F64, Mask
 from maplab_py.geometry import se3
 from maplab_py.sensors import CameraRig
@@ -32,11 +26,11 @@ class StereoPair:
     left: int  # index of the camera in its rig
     right: int
     baseline_m: float
-    pinhole: Pinhole
+    pinhole: pinholes.Pinhole
     R_C_P: F64  # (3, 3) of the left camera
-    to_left: ImageMap  # where rectified pixels lie in the left image
-    to_right: ImageMap
-    from_left: ImageMap  # where pixels of the left image lie in the rectified one
+    to_left: pinholes.ImageMap  # where rectified pixels lie in the left image
+    to_right: pinholes.ImageMap
+    from_left: pinholes.ImageMap  # where pixels of the left image lie in the rectified one
     depth_factor: F32  # (H, W) depth along the left camera's axis per depth along P's
 
     @property
@@ -115,10 +109,10 @@ def _rectify(rig: CameraRig, left: int, right: int, scale: float) -> StereoPair:
     sizes = (cameras[0].width_px, cameras[0].height_px)
     width, height = (round(scale * size) for size in (sizes if is_upright else sizes[::-1]))
     views = [(camera, R.T) for camera, R in zip(cameras, R_C_P, strict=True)]
-    pinhole = inscribed(views, width, height)
-    from_left, factor = map_from_camera(pinhole, cameras[0], R_C_P[0])
+    pinhole = pinholes.inscribed(views, width, height)
+    from_left, factor = pinholes.map_from_camera(pinhole, cameras[0], R_C_P[0])
     to_left, to_right = (
-        map_to_camera(pinhole, camera, R) for camera, R in zip(cameras, R_C_P, strict=True)
+        pinholes.map_to_camera(pinhole, camera, R) for camera, R in zip(cameras, R_C_P, strict=True)
     )
     return StereoPair(
         left, right, baseline_m, pinhole, R_C_P[0], to_left, to_right, from_left, factor

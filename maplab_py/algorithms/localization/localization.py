@@ -6,14 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from maplab_py.algorithms.localization import options as localization_options
 from maplab_py.algorithms.localization.database import LocalizationMap
 from maplab_py.algorithms.localization.localizer import Localization, Localizer, Outcome, Query
-from maplab_py.algorithms.localization.options import (
-    QUERY_PATH,
-    Distribution,
-    LocalizationOptions,
-    LocalizationReport,
-)
 from maplab_py.algorithms.loop_closure.features import MapFeatures, map_features
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import UserError
@@ -53,7 +48,7 @@ class Reference:
 def localize_missions(
     database: LocalizationMap,
     vi_map: VIMap,
-    options: LocalizationOptions,
+    options: localization_options.LocalizationOptions,
     *,
     missions: I64 | None = None,
     sequence_length: int = 1,
@@ -130,7 +125,7 @@ def describe(
     reference: Reference | None = None,
     T_R_G: F64 | None = None,
     success_error_m: float = 0.5,
-) -> LocalizationReport:
+) -> localization_options.LocalizationReport:
     """Summarise the results, and their errors if there is a reference."""
     outcomes = [answer.outcome for answer in localizations.answers]
     refused = {
@@ -146,7 +141,7 @@ def describe(
     success = int(np.count_nonzero(position < success_error_m))
     localized = int(localizations.is_localized.sum())
     answered = [answer for answer in localizations.answers if answer.outcome is Outcome.LOCALIZED]
-    return LocalizationReport(
+    return localization_options.LocalizationReport(
         map_kind="full" if database.has_descriptors else "summary",
         map_landmarks=len(database.p_G),
         map_observations=len(database.descriptors),
@@ -169,11 +164,11 @@ def describe(
     )
 
 
-def _distribution(values: F64) -> Distribution | None:
+def _distribution(values: F64) -> localization_options.Distribution | None:
     values = values[np.isfinite(values)]
     if len(values) == 0:
         return None
-    return Distribution(
+    return localization_options.Distribution(
         median=float(np.median(values)),
         mean=float(values.mean()),
         percentile_95=float(np.percentile(values, 95.0)),
@@ -252,8 +247,10 @@ def trajectory_of_queries(
     known = np.ones(len(localizations.vertex), dtype=np.bool_)
     missions = np.unique(vi_map.vertices.mission[localizations.vertex])
     if vi_map.baseframes.is_known[vi_map.missions.baseframe[missions]].all():
-        return Reference(f"{QUERY_PATH} in G", T_G_I, known), se3.identity()
-    reference = Reference(f"{QUERY_PATH}, aligned with the localised poses", T_G_I, known)
+        return Reference(f"{localization_options.QUERY_PATH} in G", T_G_I, known), se3.identity()
+    reference = Reference(
+        f"{localization_options.QUERY_PATH}, aligned with the localised poses", T_G_I, known
+    )
     return reference, _from_answers(reference, localizations, level=True)
 
 

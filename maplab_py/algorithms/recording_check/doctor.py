@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from maplab_py.algorithms.recording_check import inertial_checks, turn_checks
 from maplab_py.algorithms.recording_check.findings import (
     Finding,
     RecordingCheck,
@@ -14,29 +15,10 @@ from maplab_py.algorithms.recording_check.findings import (
     unknown,
 )
 from maplab_py.algorithms.recording_check.image_checks import check_images
-from maplab_py.algorithms.recording_check.inertial_checks import (
-    accel_unit,
-    check_accel_axes,
-    check_accel_sign,
-    check_gyro_alone,
-    check_magnitude,
-    check_noise,
-    measured_quiet,
-    raw_axes_agree,
-)
 from maplab_py.algorithms.recording_check.rates import CameraTurns, analyse_camera
 from maplab_py.algorithms.recording_check.signals import Signals, read_signals
 from maplab_py.algorithms.recording_check.stereo import StereoFit, fit_stereo
 from maplab_py.algorithms.recording_check.timing_checks import cannot_work, check_times
-from maplab_py.algorithms.recording_check.turn_checks import (
-    check_agreement,
-    check_axes,
-    check_clock,
-    check_mounting,
-    check_scale,
-    check_shutter,
-    check_unit,
-)
 from maplab_py.array_types import F64
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
@@ -169,34 +151,36 @@ def map_findings(vi_map: VIMap) -> tuple[Finding, ...]:
 def _check_motion(signals: Signals, cameras: Sequence[CameraTurns]) -> Iterator[Finding]:
     """Yield findings on the IMU, and on the cameras against it."""
     first = cameras[0]
-    quiet = measured_quiet(signals)
-    accel = signals.imu.accel_gyro[:, :3] * (accel_unit(quiet) if quiet is not None else 1.0)
-    yield from check_magnitude(signals, quiet)
-    alone = None if first.agrees else check_gyro_alone(signals)
-    yield alone if alone is not None else check_agreement(first)
-    yield check_unit(first)
-    raw_agree = raw_axes_agree(signals, accel, first)
-    yield check_axes(first, raw_agree)
+    quiet = inertial_checks.measured_quiet(signals)
+    accel = signals.imu.accel_gyro[:, :3] * (
+        inertial_checks.accel_unit(quiet) if quiet is not None else 1.0
+    )
+    yield from inertial_checks.check_magnitude(signals, quiet)
+    alone = None if first.agrees else inertial_checks.check_gyro_alone(signals)
+    yield alone if alone is not None else turn_checks.check_agreement(first)
+    yield turn_checks.check_unit(first)
+    raw_agree = inertial_checks.raw_axes_agree(signals, accel, first)
+    yield turn_checks.check_axes(first, raw_agree)
     is_exchanged = not np.array_equal(first.axes, np.eye(3))
     if not is_exchanged:  # otherwise it would only say the same again
-        axes, agree = check_accel_axes(signals, accel, first)
+        axes, agree = inertial_checks.check_accel_axes(signals, accel, first)
         yield axes
         if agree:
-            yield check_accel_sign(signals, accel, first)
-    yield check_clock(cameras, signals.device.cameras)
+            yield inertial_checks.check_accel_sign(signals, accel, first)
+    yield turn_checks.check_clock(cameras, signals.device.cameras)
     if not is_exchanged:
-        yield from check_mounting(cameras)
+        yield from turn_checks.check_mounting(cameras)
     yield from _check_stereo(cameras, _stereo_fits(signals))
-    yield check_scale(cameras)
-    yield from check_shutter(cameras, signals.device.cameras)
+    yield turn_checks.check_scale(cameras)
+    yield from turn_checks.check_shutter(cameras, signals.device.cameras)
 
 
 def _check_noise(signals: Signals, cameras: Sequence[CameraTurns]) -> Iterator[Finding]:
     """Yield findings on the noise figures of the IMU."""
     if signals.device.imu is not None:
-        quiet = measured_quiet(signals)
-        units = (accel_unit(quiet) if quiet is not None else 1.0, cameras[0].unit)
-        yield from check_noise(signals.device.imu, quiet, units)
+        quiet = inertial_checks.measured_quiet(signals)
+        units = (inertial_checks.accel_unit(quiet) if quiet is not None else 1.0, cameras[0].unit)
+        yield from inertial_checks.check_noise(signals.device.imu, quiet, units)
 
 
 def _stereo_fits(signals: Signals) -> list[StereoFit | None]:

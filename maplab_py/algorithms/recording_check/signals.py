@@ -16,17 +16,9 @@ from maplab_py.algorithms.recording_check.image_samples import (
 from maplab_py.algorithms.recording_check.stereo import StereoSampler
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import MapError
+from maplab_py.interop.recordings import protocol
 from maplab_py.interop.recordings.clocks import ClockRestart
 from maplab_py.interop.recordings.options import StreamOptions
-from maplab_py.interop.recordings.protocol import (
-    CameraImage,
-    FrameSet,
-    ImuBatch,
-    Item,
-    RecordedSensors,
-    Recording,
-    TrackedFrameSet,
-)
 from maplab_py.interop.recordings.stream import Synchroniser
 from maplab_py.progress import SILENT, Progress
 
@@ -72,7 +64,7 @@ class CameraSignal:
 class Signals:
     """Signals of a recording."""
 
-    device: RecordedSensors
+    device: protocol.RecordedSensors
     start_ns: int
     imu: ImuSignal
     cameras: tuple[CameraSignal, ...]
@@ -90,7 +82,7 @@ class Signals:
 
 
 def read_signals(
-    recording: Recording,
+    recording: protocol.Recording,
     stream: StreamOptions | None = None,
     *,
     first_s: float = 0.0,
@@ -124,10 +116,10 @@ def read_signals(
 class _Reader:
     """Collects the signals from the items of a recording."""
 
-    def __init__(self, device: RecordedSensors, start_ns: int, tolerance_ns: int) -> None:
+    def __init__(self, device: protocol.RecordedSensors, start_ns: int, tolerance_ns: int) -> None:
         self._device, self._start_ns = device, start_ns
         cameras = device.cameras
-        self._batches: list[ImuBatch] = []
+        self._batches: list[protocol.ImuBatch] = []
         self._times_ns = [array("q") for _ in cameras]
         self._samplers = [CameraSampler(camera, row) for row, camera in enumerate(cameras)]
         self._stereo = [StereoSampler(cameras[0], camera) for camera in cameras[1:]]
@@ -136,7 +128,7 @@ class _Reader:
         self._sampled = [0] * len(cameras)
         self._damaged, self._damage = [0] * len(cameras), ""
 
-    def read(self, items: Iterable[Item], first_s: float, progress: Progress) -> None:
+    def read(self, items: Iterable[protocol.Item], first_s: float, progress: Progress) -> None:
         """Take all items, or those of the first seconds and the first of each kind."""
         until_ns = self._start_ns + round(first_s * 1e9)
         for count, item in enumerate(items):
@@ -172,17 +164,17 @@ class _Reader:
         stereo = tuple(sampler.points() for sampler in self._stereo)
         return Signals(self._device, self._start_ns, imu, cameras, stereo, restart, self._damage)
 
-    def _take(self, item: Item, looks: bool) -> None:
+    def _take(self, item: protocol.Item, looks: bool) -> None:
         for event in self._sets.push(item):
-            if isinstance(event, FrameSet) and looks:
+            if isinstance(event, protocol.FrameSet) and looks:
                 self._look_at_set(event)
-        if isinstance(item, ImuBatch):
+        if isinstance(item, protocol.ImuBatch):
             self._batches.append(item)
-        elif isinstance(item, CameraImage):
+        elif isinstance(item, protocol.CameraImage):
             self._times_ns[item.camera].append(item.time_ns)
             if looks:
                 self._look_at(item)
-        elif isinstance(item, TrackedFrameSet):
+        elif isinstance(item, protocol.TrackedFrameSet):
             for frame in item.frames:
                 if frame is not None:
                     self._times_ns[frame.camera].append(item.time_ns)
@@ -197,7 +189,7 @@ class _Reader:
             is_in = since_s < _DENSE_S or since_s % _PERIOD_S < _BURST_S
         return is_in and self._samplers[camera].is_due(time_ns)
 
-    def _look_at(self, image: CameraImage) -> None:
+    def _look_at(self, image: protocol.CameraImage) -> None:
         sampler, camera = self._samplers[image.camera], image.camera
         try:
             if self._is_sampled(camera, image.time_ns):
@@ -210,7 +202,7 @@ class _Reader:
             self._damaged[camera] += 1
             self._damage = self._damage or str(error)
 
-    def _look_at_set(self, images: FrameSet) -> None:
+    def _look_at_set(self, images: protocol.FrameSet) -> None:
         if not self._stereo or images.time_ns < self._next_stereo_ns:
             return
         self._next_stereo_ns = images.time_ns + round(_STEREO_EVERY_S * 1e9)

@@ -16,12 +16,7 @@ from maplab_py.interop.bags.options import BagImport, BagImportOptions
 from maplab_py.interop.bags.sensor_messages import CAMERA_INFO, CLOUD, COMPRESSED, IMAGE, cloud_of
 from maplab_py.interop.images import CONTAINER_BITS, sampled
 from maplab_py.interop.recordings import bag_files
-from maplab_py.interop.recordings.images import (
-    EncodedImage,
-    camera_bits,
-    check_size,
-    image_of_message,
-)
+from maplab_py.interop.recordings import images as recorded_images
 from maplab_py.interop.recordings.protocol import CameraImage
 from maplab_py.interop.resources import matching, point_clouds
 from maplab_py.interop.resources.depth_maps import MM_PER_M, RAW_DEPTH_MAPS, encoded_depth
@@ -291,7 +286,7 @@ def _import_images(
             new.add(RAW_DEPTH_MAPS, encoded_depth(_depth_m(message, name, camera)))
         else:
             stamp_ns = int(topic.stamps_ns[number])
-            data = image_of_message(message, name, camera)
+            data = recorded_images.image_of_message(message, name, camera)
             add_image(new, CameraImage(0, stamp_ns, stamp_ns, data, bits), link=False)
     attached = new.attached(vi_map, np.arange(len(owners)), owners) if len(owners) else vi_map
     return attached, BagImport(
@@ -349,11 +344,11 @@ def _bits(topic: _Topic, camera: Camera, numbers: I64) -> int:
     """Return the bits of the camera's values, sought in some of its messages (numbers, sorted)."""
     images = []
     for _, message in topic.chosen(numbers[sampled(len(numbers))]):
-        data = image_of_message(message, topic.name, camera)
+        data = recorded_images.image_of_message(message, topic.name, camera)
         images.append(CameraImage(0, 0, 0, data))
         if data.bits:
             break
-    return camera_bits(images)
+    return recorded_images.camera_bits(images)
 
 
 def _depth_m(message: Any, name: str, camera: Camera) -> F32:
@@ -362,15 +357,15 @@ def _depth_m(message: Any, name: str, camera: Camera) -> F32:
         if not message.format.startswith("16UC1"):
             raise MapError(f"{name}: compressed depth {message.format} is not supported: use 16UC1")
         data = message.data.tobytes()[_COMPRESSED_DEPTH_HEADER:]
-        pixels = EncodedImage(name, camera, lambda: data).decode()
+        pixels = recorded_images.EncodedImage(name, camera, lambda: data).decode()
         return np.asarray(pixels / np.float32(MM_PER_M), dtype=np.float32)
     if message.encoding == "16UC1":
-        pixels = image_of_message(message, name, camera).decode()
+        pixels = recorded_images.image_of_message(message, name, camera).decode()
         return np.asarray(pixels / np.float32(MM_PER_M), dtype=np.float32)
     if message.encoding != "32FC1":
         raise MapError(f"{name}: encoding '{message.encoding}' in a topic of depth: record 16UC1")
     width, height, step = int(message.width), int(message.height), int(message.step)
-    check_size(name, camera, width, height)
+    recorded_images.check_size(name, camera, width, height)
     row_bytes = width * np.dtype(np.float32).itemsize
     if step < row_bytes or len(message.data) < step * height:
         raise MapError(f"{name}: the image is truncated: copy the bag again")

@@ -17,16 +17,8 @@ from typing import Any
 from xmlrpc.server import SimpleXMLRPCServer
 
 from maplab_py.errors import MaplabError, UserError
+from maplab_py.interop.live import transport as transports
 from maplab_py.interop.live.options import NetworkOptions
-from maplab_py.interop.live.transport import (
-    MAX_MESSAGE_BYTES,
-    Publish,
-    Take,
-    Topic,
-    answer_of,
-    listening_address,
-    ros2_type,
-)
 from maplab_py.interop.recordings.bag_files import message_types
 
 # Source: wiki.ros.org, "ROS/TCPROS", "ROS/Connection Header"
@@ -82,7 +74,7 @@ def receive_message(connection: socket.socket) -> bytes:
         ConnectionProblem: It is too large, or the connection ends.
         OSError: The connection fails.
     """
-    return bytes(_receive_block(connection, MAX_MESSAGE_BYTES, "message"))
+    return bytes(_receive_block(connection, transports.MAX_MESSAGE_BYTES, "message"))
 
 
 def _receive_block(connection: socket.socket, limit: int, what: str) -> bytearray:
@@ -128,14 +120,14 @@ class Ros1:
         self.problems: list[str] = []
         self._node = f"/maplab_{os.getpid()}_{time.monotonic_ns() % 10**9}"
         self._store = message_types(is_ros_2=False)
-        self._subscriptions: dict[str, tuple[Topic, Take]] = {}
+        self._subscriptions: dict[str, tuple[transports.Topic, transports.Take]] = {}
         self._publications: dict[str, _Publication] = {}
         self._connections: dict[tuple[str, str], socket.socket | None] = {}
         self._lock = threading.Lock()
         self._is_closed = threading.Event()
         self._had_master = True
-        answer_of(self.topics, network.live_wait_s)  # says whether there is a master
-        host = listening_address(network)
+        transports.answer_of(self.topics, network.live_wait_s)  # says whether there is a master
+        host = transports.listening_address(network)
         self._server = socket.create_server((host, 0))
         self._rpc = SimpleXMLRPCServer((host, 0), logRequests=False, allow_none=True)
         self._api = f"http://{host}:{self._rpc.server_address[1]}/"
@@ -144,22 +136,22 @@ class Ros1:
         for work in (self._rpc.serve_forever, self._accept, self._keep_registered):
             threading.Thread(target=work, name="ros1", daemon=True).start()
 
-    def topics(self) -> dict[str, Topic]:
+    def topics(self) -> dict[str, transports.Topic]:
         """Return the topics that are published now, by name."""
         types = dict(self._ask("getTopicTypes"))
         publishers = dict(self._ask("getSystemState")[0])
         return {
-            name: Topic(name, ros2_type(types[name]), len(nodes))
+            name: transports.Topic(name, transports.ros2_type(types[name]), len(nodes))
             for name, nodes in sorted(publishers.items())
             if name in types and set(nodes) != {self._node}
         }
 
-    def subscribe(self, topic: Topic, take: Take) -> None:
+    def subscribe(self, topic: transports.Topic, take: transports.Take) -> None:
         """Call a function with every message of a topic from now on."""
         self._subscriptions[topic.name] = topic, take
         self._connect(topic.name, self._register(topic))
 
-    def advertise(self, topic: str, kind: str) -> Publish:
+    def advertise(self, topic: str, kind: str) -> transports.Publish:
         """Announce messages of a type; return what sends them."""
         definition, md5sum = self._store.generate_msgdef(kind, ros_version=1)
         publication = _Publication(self._node, topic, _ros1_type(kind), md5sum, definition)
@@ -211,7 +203,7 @@ class Ros1:
             raise UserError(f"{self.name}: {method} {' '.join(arguments[:1])}: {message}")
         return value
 
-    def _register(self, topic: Topic) -> list[str]:
+    def _register(self, topic: transports.Topic) -> list[str]:
         kind = _ros1_type(topic.type)
         return list(self._ask("registerSubscriber", topic.name, kind, self._api))
 
@@ -286,7 +278,7 @@ class Ros1:
             with self._lock:
                 self._connections.pop((topic, uri), None)
 
-    def _opened(self, topic: Topic, uri: str) -> socket.socket:
+    def _opened(self, topic: transports.Topic, uri: str) -> socket.socket:
         """Return a connection to a publisher after the exchange of headers."""
         with _proxy(uri, _PEER_TIMEOUT_S) as publisher:
             answer: Any = publisher.requestTopic(self._node, topic.name, [["TCPROS"]])

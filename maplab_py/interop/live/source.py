@@ -15,30 +15,15 @@ from maplab_py.array_types import F64
 from maplab_py.cancellation import current_token
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.images import Pixels, bits_of
+from maplab_py.interop.live import transport as transports
 from maplab_py.interop.live.options import LiveOptions
 from maplab_py.interop.live.receiving import Inbox, Message, TopicCounts
-from maplab_py.interop.live.transport import (
-    LOOK_EVERY_S,
-    MAX_MESSAGE_BYTES,
-    RAISE_RECEIVE_BUFFERS,
-    Topic,
-    Transport,
-    topic_of,
-    wait_for_topics,
-)
+from maplab_py.interop.recordings import protocol
 from maplab_py.interop.recordings.bag_files import imu_sample, message_types
 from maplab_py.interop.recordings.bags import IMAGE_TYPES, IMU_TYPE
 from maplab_py.interop.recordings.images import image_of_message
 from maplab_py.interop.recordings.options import SourceOptions
 from maplab_py.interop.recordings.paired_imu import PairedImu, Sample
-from maplab_py.interop.recordings.protocol import (
-    CameraImage,
-    ImageData,
-    ImuBatch,
-    Item,
-    PartSpan,
-    RecordedSensors,
-)
 from maplab_py.report import counted
 from maplab_py.sensors import Camera
 
@@ -84,8 +69,8 @@ class LiveRecording:
 
     def __init__(
         self,
-        transport: Transport,
-        device: RecordedSensors,
+        transport: transports.Transport,
+        device: protocol.RecordedSensors,
         source: SourceOptions,
         options: LiveOptions,
         *,
@@ -113,7 +98,7 @@ class LiveRecording:
         self._transport, self._options, self._tell = transport, options, tell
         self._imu_names = _imu_topics(device, source)
         cameras = _camera_topics(device, source)
-        topics = wait_for_topics(transport, [*self._imu_names, *cameras], wait_s)
+        topics = transports.wait_for_topics(transport, [*self._imu_names, *cameras], wait_s)
         for topic, wanted in zip(topics, self._wanted_types(), strict=True):
             _check_type(transport, topic, wanted)
         self._camera_types = [topic.type for topic in topics[len(self._imu_names) :]]
@@ -170,11 +155,13 @@ class LiveRecording:
         """Time of the first item; a live source begins now, so it has none."""
         return 0
 
-    def parts(self) -> tuple[PartSpan, ...]:
+    def parts(self) -> tuple[protocol.PartSpan, ...]:
         """Return no parts: a live source has no end."""
         return ()
 
-    def items(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Item]:
+    def items(
+        self, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[protocol.Item]:
         """Yield what arrives; see `Recording.items`.
 
         Raises:
@@ -188,7 +175,7 @@ class LiveRecording:
         self.subscribe()
         heard_s, has_told = time.monotonic(), False
         while not self._is_to_end():
-            arrivals = self.inbox.take(LOOK_EVERY_S)
+            arrivals = self.inbox.take(transports.LOOK_EVERY_S)
             self._tell_problems()
             if arrivals is None:
                 silent_s = time.monotonic() - heard_s
@@ -239,7 +226,7 @@ class LiveRecording:
             self._tell(problems[self._told])
             self._told += 1
 
-    def _batch(self, messages: list[Message]) -> ImuBatch | None:
+    def _batch(self, messages: list[Message]) -> protocol.ImuBatch | None:
         """Return the samples of messages, None if there are none that can be used."""
         times_ns, samples = [], []
         for message in messages:
@@ -259,9 +246,11 @@ class LiveRecording:
                     samples.append(row)
         if not samples or self.device.imu is None:
             return None
-        return ImuBatch.of(self.device.imu, np.array(times_ns, dtype=np.int64), np.array(samples))
+        return protocol.ImuBatch.of(
+            self.device.imu, np.array(times_ns, dtype=np.int64), np.array(samples)
+        )
 
-    def _images(self, messages: tuple[Message, ...]) -> list[CameraImage]:
+    def _images(self, messages: tuple[Message, ...]) -> list[protocol.CameraImage]:
         """Return the decoded images of a set, none if one is damaged.
 
         Raises:
@@ -285,7 +274,7 @@ class LiveRecording:
                 return []
             bits = self._bits.setdefault(row, self._given_bits or data.bits or bits_of([pixels]))
             decoded = _Decoded(pixels, data.encoding, bits)
-            images.append(CameraImage(row, message.time_ns, stamp_ns, decoded, bits))
+            images.append(protocol.CameraImage(row, message.time_ns, stamp_ns, decoded, bits))
         return images
 
     def _remember(self, messages: tuple[Message, ...]) -> None:
@@ -293,7 +282,7 @@ class LiveRecording:
         if len(self._arrivals) > _MAX_REMEMBERED:
             self._arrivals.popitem(last=False)
 
-    def _check_samples(self, batch: ImuBatch) -> None:
+    def _check_samples(self, batch: protocol.ImuBatch) -> None:
         """Compare units and clocks of the first seconds with what they must be.
 
         Raises:
@@ -362,7 +351,7 @@ class LiveRecording:
                 yield (
                     f"{name}: about {counted(counts.missing, 'message')} missing by the stamps: where the "
                     "driver leaves none out, raise the receive buffers (on Linux "
-                    f"`{RAISE_RECEIVE_BUFFERS}`), or publish compressed images"
+                    f"`{transports.RAISE_RECEIVE_BUFFERS}`), or publish compressed images"
                 )
             if counts.damaged:
                 yield f"{name}: {counted(counts.damaged, 'damaged message')} left out"
@@ -377,7 +366,7 @@ class LiveRecording:
             yield f"pose {median:.0f} ms after the arrival of its images (median; {worst:.0f} ms at 99 %)"
 
 
-def _imu_topics(device: RecordedSensors, source: SourceOptions) -> list[str]:
+def _imu_topics(device: protocol.RecordedSensors, source: SourceOptions) -> list[str]:
     """Return the topic of the IMU, or those of gyroscope and accelerometer.
 
     Raises:
@@ -394,10 +383,10 @@ def _imu_topics(device: RecordedSensors, source: SourceOptions) -> list[str]:
             "the calibration names no topic of the IMU: give --imu_topic=TOPIC, or two topics "
             "separated by a comma (gyroscope, accelerometer); live_topics lists what there is"
         )
-    return [topic_of(name) for name in names]
+    return [transports.topic_of(name) for name in names]
 
 
-def _camera_topics(device: RecordedSensors, source: SourceOptions) -> list[str]:
+def _camera_topics(device: protocol.RecordedSensors, source: SourceOptions) -> list[str]:
     """Return the topic of each camera.
 
     Raises:
@@ -414,10 +403,12 @@ def _camera_topics(device: RecordedSensors, source: SourceOptions) -> list[str]:
         )
     if len(set(names)) < len(names):
         raise UserError("two cameras have the same topic: give different --camera_topics")
-    return [topic_of(name) for name in names]
+    return [transports.topic_of(name) for name in names]
 
 
-def _check_type(transport: Transport, topic: Topic, wanted: Sequence[str]) -> None:
+def _check_type(
+    transport: transports.Transport, topic: transports.Topic, wanted: Sequence[str]
+) -> None:
     if topic.type not in wanted:
         raise UserError(
             f"{transport.name}: {topic.name} has messages of type {topic.type}, needed is "
@@ -445,7 +436,7 @@ def imu_values(data: bytes, *, is_ros_2: bool) -> Sample:
 
 def image_data(
     data: bytes, kind: str, camera: Camera, name: str, store: Any, *, is_ros_2: bool
-) -> ImageData:
+) -> protocol.ImageData:
     """Return the image of a serialised message.
 
     Args:
@@ -459,7 +450,7 @@ def image_data(
     Raises:
         MapError: The message is damaged.
     """
-    if len(data) > MAX_MESSAGE_BYTES:
+    if len(data) > transports.MAX_MESSAGE_BYTES:
         raise MapError(f"{name}: the message has {len(data):,} bytes: refused")
     decode = store.deserialize_cdr if is_ros_2 else store.deserialize_ros1
     try:

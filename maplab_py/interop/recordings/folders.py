@@ -20,27 +20,9 @@ from maplab_py.errors import MapError, MaplabError
 from maplab_py.input_files import read_foreign_text
 from maplab_py.interop.images import CONTAINER_BITS, sampled
 from maplab_py.interop.imu_csv import read_imu_csv
-from maplab_py.interop.recordings.clocks import (
-    Dropped,
-    check_common_time,
-    check_dropped,
-    check_part,
-    common_part_count,
-    dropped_note,
-    listed_rows,
-    order_of_time,
-    parts_of,
-    restart_error,
-)
+from maplab_py.interop.recordings import clocks, protocol
 from maplab_py.interop.recordings.images import bits_note, camera_bits, image_file
 from maplab_py.interop.recordings.options import ReadingOptions
-from maplab_py.interop.recordings.protocol import (
-    CameraImage,
-    ImuBatch,
-    Item,
-    PartSpan,
-    RecordedSensors,
-)
 from maplab_py.interop.stamps import IMAGES, parse_stamps
 from maplab_py.interop.text_table import is_time_name
 from maplab_py.sensors import Camera
@@ -68,7 +50,7 @@ class FolderRecording:
     def __init__(
         self,
         root: Path,
-        device: RecordedSensors,
+        device: protocol.RecordedSensors,
         camera_folders: tuple[int, ...] = (),
         reading: ReadingOptions = _DEFAULT,
     ) -> None:
@@ -152,10 +134,12 @@ class FolderRecording:
         """
         part = self._reading.recording_part
         count = max(len(table.parts) for table in self._tables)
-        check_part(self.name, part, count)
+        clocks.check_part(self.name, part, count)
         if part:
             imu = None if self._imu is None else len(self._imu.parts)
-            common_part_count(self.name, imu, [len(camera.parts) for camera in self._cameras])
+            clocks.common_part_count(
+                self.name, imu, [len(camera.parts) for camera in self._cameras]
+            )
             restarting = next(table for table in self._tables if len(table.parts) == count)
             for table in self._tables:
                 if len(table.parts) < count:
@@ -182,9 +166,9 @@ class FolderRecording:
             shift_ns = self.device.cameras[0].time_offset_ns + span_ns[0] - images_ns[0]
             proposal = f"{shift_ns} lets both begin together"
             is_apart = self._is_apart and not has_shift
-            check_common_time(self.name, span_ns, images_ns, proposal, is_apart=is_apart)
+            clocks.check_common_time(self.name, span_ns, images_ns, proposal, is_apart=is_apart)
 
-    def parts(self) -> tuple[PartSpan, ...]:
+    def parts(self) -> tuple[protocol.PartSpan, ...]:
         """Return the parts into which restarts of the clock divide the recording."""
         spans = []
         for part in range(max(len(table.parts) for table in self._tables)):
@@ -194,7 +178,9 @@ class FolderRecording:
             counts = [len(t.times(part)) if part < len(t.parts) else 0 for t in self._tables]
             samples = 0 if self._imu is None else counts.pop(0)
             spans.append(
-                PartSpan(part + 1, first_ns, (last_ns - first_ns) * 1e-9, samples, sum(counts))
+                protocol.PartSpan(
+                    part + 1, first_ns, (last_ns - first_ns) * 1e-9, samples, sum(counts)
+                )
             )
         return tuple(spans)
 
@@ -213,7 +199,9 @@ class FolderRecording:
                 sizes[row] = image.data.size_px()
         return sizes
 
-    def items(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Item]:
+    def items(
+        self, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[protocol.Item]:
         """Yield images and the IMU samples between them; see `Recording.items`."""
         for table in self._tables:
             table.check(self._part, start_ns, end_ns, self._reading.max_late_share)
@@ -236,12 +224,12 @@ class FolderRecording:
                 until = int(np.searchsorted(times_ns, image.time_ns, side="right"))
                 while row < until:
                     part = slice(row, min(until, row + _LARGEST_BATCH))
-                    yield ImuBatch.of(imu, times_ns[part], values[part])
+                    yield protocol.ImuBatch.of(imu, times_ns[part], values[part])
                     row = part.stop
                 yield image
             for first in range(row, len(times_ns), _LARGEST_BATCH):
                 part = slice(first, first + _LARGEST_BATCH)
-                yield ImuBatch.of(imu, times_ns[part], values[part])
+                yield protocol.ImuBatch.of(imu, times_ns[part], values[part])
         if not self._reading.recording_part:
             for table in self._tables:
                 table.check_restart(end_ns)
@@ -258,7 +246,7 @@ class _Table:
         self, path: Path, stamps_ns: I64, lines: I64, note: str, time_offset_ns: int = 0
     ) -> None:
         self._path, self.name = path, path.parent.name
-        self.order = order_of_time(stamps_ns)
+        self.order = clocks.order_of_time(stamps_ns)
         is_sorted = bool(np.all(np.diff(self.order) == 1))
         sorting = "" if is_sorted else f"{path}: rows are not in the order of time: they are sorted"
         self.note = "; ".join(filter(None, (note, sorting)))
@@ -269,16 +257,16 @@ class _Table:
                 f"{path}: all time stamps are 0, as of a driver that sets none: write the times at which the "
                 "rows were recorded into the table"
             )
-        self.parts, self._dropped = parts_of(self.stamps_ns)
+        self.parts, self._dropped = clocks.parts_of(self.stamps_ns)
 
     @property
     def dropped_note(self) -> str:
         """One line on rows that are left out; empty without any."""
         if not len(self._dropped):
             return ""
-        lines = list(listed_rows(self._lines[self._dropped]))
+        lines = list(clocks.listed_rows(self._lines[self._dropped]))
         shown = ", ".join(lines[:_MOST_LINES]) + (", ..." if len(lines) > _MOST_LINES else "")
-        note = dropped_note(str(self._path), len(self._dropped), self._first(self._dropped))
+        note = clocks.dropped_note(str(self._path), len(self._dropped), self._first(self._dropped))
         return f"{note} (lines {shown})"
 
     def times(self, part: int) -> I64:
@@ -332,7 +320,7 @@ class _Table:
             line = int(self._lines[inside[0]])
             count = len(rows) + len(inside)
             where = f"{self._path}:{line}"
-            check_dropped(where, len(inside), count, self._first(inside), max_late_share)
+            clocks.check_dropped(where, len(inside), count, self._first(inside), max_late_share)
 
     def check_restart(self, end_ns: int | None) -> None:
         """Check that the clock does not start again before a time.
@@ -342,13 +330,13 @@ class _Table:
         """
         if len(self.parts) > 1 and (end_ns is None or self.times(0)[-1] < end_ns):
             before, after = int(self.parts[0][-1]), int(self.parts[1][0])
-            restart = Dropped(int(self.stamps_ns[after]), int(self.stamps_ns[before]))
-            raise restart_error(f"{self._path}:{self._lines[after]}", restart)
+            restart = clocks.Dropped(int(self.stamps_ns[after]), int(self.stamps_ns[before]))
+            raise clocks.restart_error(f"{self._path}:{self._lines[after]}", restart)
 
-    def _first(self, dropped: I64) -> Dropped:
+    def _first(self, dropped: I64) -> clocks.Dropped:
         row = int(dropped[0])
         before = self.stamps_ns[row - 1] if row else self.stamps_ns[self.parts[0][0]]
-        return Dropped(int(self.stamps_ns[row]), int(before))
+        return clocks.Dropped(int(self.stamps_ns[row]), int(before))
 
 
 class _ImuTable(_Table):
@@ -400,16 +388,16 @@ class _ImageTable(_Table):
             if not all(map(len, self.parts)):
                 raise MapError(f"{self._folder}: all images are missing: copy them there")
 
-    def images(self, camera: int, rows: I64, bits: int) -> Iterator[CameraImage]:
+    def images(self, camera: int, rows: I64, bits: int) -> Iterator[protocol.CameraImage]:
         """Yield the images of rows as those of the camera with this number."""
         for row in rows.tolist():
             yield self.image(camera, row, bits)
 
-    def image(self, camera: int, row: int, bits: int = CONTAINER_BITS) -> CameraImage:
+    def image(self, camera: int, row: int, bits: int = CONTAINER_BITS) -> protocol.CameraImage:
         """Return the image of a row as that of the camera with this number."""
         data = image_file(self._folder / self._files[row], self._camera)
         times_ns = int(self.times_ns[row]), int(self.stamps_ns[row])
-        return CameraImage(camera, *times_ns, data, bits)
+        return protocol.CameraImage(camera, *times_ns, data, bits)
 
 
 def _image_rows(path: Path) -> tuple[list[str], list[str], I64, str]:

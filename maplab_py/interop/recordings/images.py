@@ -8,18 +8,7 @@ from typing import Any
 
 from maplab_py.errors import MapError
 from maplab_py.input_files import read_bytes
-from maplab_py.interop.images import (
-    CONTAINER_BITS,
-    SAMPLES,
-    Pixels,
-    bits_of,
-    check_raw,
-    encoded_pixels,
-    encoded_size,
-    encoding_of,
-    has_16_bits,
-    raw_pixels,
-)
+from maplab_py.interop import images as pixel_data
 from maplab_py.interop.recordings.protocol import CameraImage
 from maplab_py.sensors import Camera
 
@@ -45,28 +34,34 @@ class EncodedImage:
         Raises:
             MapError: The image cannot be read.
         """
-        return encoded_size(self.name, self.read())
+        return pixel_data.encoded_size(self.name, self.read())
 
-    def decode(self) -> Pixels:
+    def decode(self) -> pixel_data.Pixels:
         """Return the pixels; see `ImageData.decode`."""
-        return encoded_pixels(self.name, self._checked_bytes(), self.form)
+        return pixel_data.encoded_pixels(self.name, self._checked_bytes(), self.form)
 
     @property
     def encoding(self) -> str:
         """Name of the encoding."""
         data = self.read()
-        kind = "PNG, 16 bits" if has_16_bits(data) else "PNG" if data[1:4] == b"PNG" else "JPEG"
+        kind = (
+            "PNG, 16 bits"
+            if pixel_data.has_16_bits(data)
+            else "PNG"
+            if data[1:4] == b"PNG"
+            else "JPEG"
+        )
         source = self.form.split(";")[0].strip()
         return f"{kind} of {source}" if source.startswith("bayer_") else kind
 
     @property
     def bits(self) -> int:
         """Bits of a value; 0 = not known without looking at the values."""
-        return 0 if has_16_bits(self.read()) else 8
+        return 0 if pixel_data.has_16_bits(self.read()) else 8
 
     def _checked_bytes(self) -> bytes:
         data = self.read()
-        width, height = encoded_size(self.name, data, self.form)
+        width, height = pixel_data.encoded_size(self.name, data, self.form)
         check_size(self.name, self.camera, width, height)
         return data
 
@@ -92,12 +87,12 @@ class RawImage:
         """Check size and completeness; see `ImageData.check`."""
         check_size(self.name, self.camera, self.width_px, self.height_px)
         size = self.width_px, self.height_px
-        check_raw(self.name, self.encoding, *size, self.step, len(self.data))
+        pixel_data.check_raw(self.name, self.encoding, *size, self.step, len(self.data))
 
-    def decode(self) -> Pixels:
+    def decode(self) -> pixel_data.Pixels:
         """Return the pixels; see `ImageData.decode`."""
         self.check()
-        return raw_pixels(
+        return pixel_data.raw_pixels(
             self.name,
             self.encoding,
             self.width_px,
@@ -110,7 +105,7 @@ class RawImage:
     @property
     def bits(self) -> int:
         """Bits of a value; 0 = not known without looking at the values."""
-        described = encoding_of(self.encoding, self.name)
+        described = pixel_data.encoding_of(self.encoding, self.name)
         return described.bits or (8 if described.type().itemsize == 1 else 0)
 
 
@@ -153,14 +148,14 @@ def camera_bits(images: Iterable[CameraImage]) -> int:
             if image.data.bits:
                 return image.data.bits
             decoded.append(image.decode())
-    return bits_of(decoded) if decoded else CONTAINER_BITS
+    return pixel_data.bits_of(decoded) if decoded else pixel_data.CONTAINER_BITS
 
 
 def bits_note(camera: int, bits: int) -> str:
     """Return a line on a camera whose values of fewer bits are stored in 16."""
     return (
-        f"camera {camera}: images of 16 bits are read as {bits} bits: no value of {SAMPLES} images is above "
-        f"{(1 << bits) - 1} (another range: --image_bits)"
+        f"camera {camera}: images of 16 bits are read as {bits} bits: no value of "
+        f"{pixel_data.SAMPLES} images is above {(1 << bits) - 1} (another range: --image_bits)"
     )
 
 

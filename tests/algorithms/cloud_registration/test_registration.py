@@ -8,19 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from maplab_py.algorithms.cloud_registration import registration, workflow
 from maplab_py.algorithms.cloud_registration.options import CloudClosureOptions, CloudClosureReport
-from maplab_py.algorithms.cloud_registration.registration import (
-    PreparedCloud,
-    Registration,
-    describe_fit,
-    prepare_cloud,
-    register_clouds,
-)
-from maplab_py.algorithms.cloud_registration.workflow import (
-    close_cloud_loops,
-    compare_clouds,
-    register_globally,
-)
 from maplab_py.algorithms.loop_closure.closure_record import read_record
 from maplab_py.algorithms.loop_closure.listing import find_closures, list_closures
 from maplab_py.algorithms.loop_closure.record_updates import remove_closures
@@ -29,15 +18,8 @@ from maplab_py.algorithms.relaxation.relaxation import relax
 from maplab_py.array_types import F64
 from maplab_py.errors import FlagError, MapError, UserError
 from maplab_py.geometry import se3, so3
+from maplab_py.simulation import scenario as sim
 from maplab_py.simulation.evaluation import evaluate_map
-from maplab_py.simulation.scenario import (
-    DriftOptions,
-    LidarOptions,
-    MeasurementOptions,
-    Scenario,
-    SessionOptions,
-    WorldOptions,
-)
 from maplab_py.simulation.simulate import Lidar, simulate
 from maplab_py.simulation.truth import Truth
 from maplab_py.simulation.world import World, make_world
@@ -46,8 +28,8 @@ from maplab_py.vimap.ids import IdIndex, to_hex
 from maplab_py.vimap.queries import without_resources
 from tests.simulation.small import simulated
 
-ROOM = WorldOptions(landmarks_per_room=200)
-LONG_CORRIDOR = WorldOptions(
+ROOM = sim.WorldOptions(landmarks_per_room=200)
+LONG_CORRIDOR = sim.WorldOptions(
     layout="corridor", room_size_m=(90.0, 70.0, 3.0), furniture_per_room=0, landmarks_per_room=200
 )
 CORRIDOR = dataclasses.replace(LONG_CORRIDOR, room_size_m=(16.0, 12.0, 3.0), landmarks_per_room=600)
@@ -64,11 +46,11 @@ class Pair:
     start: F64  # (7,)
 
 
-def pairs(options: WorldOptions, count: int, seed: int = 0) -> Iterator[Pair]:
+def pairs(options: sim.WorldOptions, count: int, seed: int = 0) -> Iterator[Pair]:
     """Yield pairs of up to 3 m distance, with starts off by 0.5 m and 10 deg."""
     rng = np.random.default_rng(seed)
     world = make_world(options, rng)
-    lidar = Lidar.of(world, LidarOptions(rate_hz=1.0), rng)
+    lidar = Lidar.of(world, sim.LidarOptions(rate_hz=1.0), rng)
     for _ in range(count):
         a = _free_position(world, rng)
         b = _free_position(world, rng)
@@ -108,15 +90,15 @@ def errors(T_A_B: F64, estimate: F64) -> tuple[float, float]:
 
 
 def session(
-    world: WorldOptions, motion: SessionOptions, *, rate_hz: float, seed: int = 1
-) -> Scenario:
+    world: sim.WorldOptions, motion: sim.SessionOptions, *, rate_hz: float, seed: int = 1
+) -> sim.Scenario:
     """Return a drifting session with a lidar and few landmarks."""
-    return Scenario(
+    return sim.Scenario(
         world=world,
         sessions=(motion,),
-        lidar=LidarOptions(rate_hz=rate_hz),
-        measurement=MeasurementOptions(max_keypoints=30),
-        drift=DriftOptions(yaw_walk_deg=0.5, position_walk=0.03),
+        lidar=sim.LidarOptions(rate_hz=rate_hz),
+        measurement=sim.MeasurementOptions(max_keypoints=30),
+        drift=sim.DriftOptions(yaw_walk_deg=0.5, position_walk=0.03),
     ).with_seed(seed)
 
 
@@ -132,13 +114,15 @@ def edge_errors(vi_map: VIMap, truth: Truth) -> tuple[F64, F64]:
 OPTIONS = CloudClosureOptions()
 
 
-def _prepared(pair: Pair) -> tuple[PreparedCloud, PreparedCloud]:
+def _prepared(pair: Pair) -> tuple[registration.PreparedCloud, registration.PreparedCloud]:
     voxel_m = OPTIONS.voxel_size_m
-    return prepare_cloud(pair.target, voxel_m, "a"), prepare_cloud(pair.source, voxel_m, "b")
+    return registration.prepare_cloud(pair.target, voxel_m, "a"), registration.prepare_cloud(
+        pair.source, voxel_m, "b"
+    )
 
 
-def _registered(pair: Pair) -> Registration:
-    return register_clouds(*_prepared(pair), pair.start, OPTIONS.max_correspondence_m)
+def _registered(pair: Pair) -> registration.Registration:
+    return registration.register_clouds(*_prepared(pair), pair.start, OPTIONS.max_correspondence_m)
 
 
 def _share_registered(count: int, seeds: int) -> float:
@@ -162,14 +146,14 @@ def test_many_pairs_of_clouds() -> None:
 def test_a_true_pose_fits_and_others_do_not() -> None:
     pair = next(pairs(ROOM, 1, seed=3))
     target, source = _prepared(pair)
-    fit = describe_fit(target, source, pair.T_T_S, OPTIONS.max_correspondence_m)
-    true = compare_clouds(target, source, pair.T_T_S)
+    fit = registration.describe_fit(target, source, pair.T_T_S, OPTIONS.max_correspondence_m)
+    true = workflow.compare_clouds(target, source, pair.T_T_S)
     assert fit.residual_m < OPTIONS.max_residual_m
     assert fit.constraint > OPTIONS.min_constraint
     assert true.overlap > 0.8
     assert true.conflict < 0.01
     turned = se3.compose(pair.T_T_S, se3.make(so3.exp([0.0, 0.0, 0.8]), np.array([2.0, 1.0, 0.0])))
-    wrong = compare_clouds(target, source, turned)
+    wrong = workflow.compare_clouds(target, source, turned)
     assert wrong.overlap < true.overlap - 0.2 or wrong.conflict > 0.05
 
 
@@ -199,10 +183,10 @@ def test_global_registration_needs_no_initial_pose() -> None:
     count = 0
     for pair in pairs(ROOM, 4, seed=2):
         target, source = _prepared(pair)
-        start = register_globally(target, source, OPTIONS.voxel_size_m)
+        start = workflow.register_globally(target, source, OPTIONS.voxel_size_m)
         if start is None:
             continue
-        fit = register_clouds(target, source, start, OPTIONS.max_correspondence_m)
+        fit = registration.register_clouds(target, source, start, OPTIONS.max_correspondence_m)
         off_m, off_deg = errors(pair.T_T_S, fit.T_T_S)
         count += off_m < 0.05 and off_deg < 0.5
     assert count >= 2
@@ -215,22 +199,22 @@ def test_equal_input_gives_equal_poses() -> None:
 
 def test_a_cloud_with_few_points_is_refused() -> None:
     with pytest.raises(MapError, match="--lidar_lc_voxel_size_m"):
-        prepare_cloud(np.random.default_rng(1).normal(size=(50, 3)), 0.1, "cloud abc")
+        registration.prepare_cloud(np.random.default_rng(1).normal(size=(50, 3)), 0.1, "cloud abc")
 
 
-AROUND = SessionOptions(duration_s=24.0, turns=1.8)
+AROUND = sim.SessionOptions(duration_s=24.0, turns=1.8)
 SHORT = session(ROOM, AROUND, rate_hz=1.0)
-WALK = SessionOptions(
+WALK = sim.SessionOptions(
     kind="corridor", duration_s=60.0, turns=1.5, wall_distance_m=1.2, shake_m=0.02
 )
-TWO_ROOMS = WorldOptions(rooms=2, landmarks_per_room=300)
-TOUR = SessionOptions(kind="loop", duration_s=60.0, turns=2.0, wall_distance_m=2.8)
+TWO_ROOMS = sim.WorldOptions(rooms=2, landmarks_per_room=300)
+TOUR = sim.SessionOptions(kind="loop", duration_s=60.0, turns=2.0, wall_distance_m=2.8)
 
 
 @functools.cache
 def closed() -> tuple[VIMap, CloudClosureReport]:
     """Return the short walk with the loops that its clouds close, and the report."""
-    return close_cloud_loops(simulated(SHORT).maps[0], Path(), OPTIONS)
+    return workflow.close_cloud_loops(simulated(SHORT).maps[0], Path(), OPTIONS)
 
 
 def test_clouds_close_loops_that_a_relaxation_uses() -> None:
@@ -258,14 +242,14 @@ def test_closures_are_recorded_and_removed_like_those_of_images() -> None:
     edge = vi_map.loop_closure_edges.id[0]
     removed, _ = remove_closures(vi_map, find_closures(vi_map, [to_hex(edge)]))
     assert len(removed.loop_closure_edges) == report.edges_added - 1
-    again, second = close_cloud_loops(removed, Path(), OPTIONS)
+    again, second = workflow.close_cloud_loops(removed, Path(), OPTIONS)
     assert "removed by hand" in second.refused
     assert to_hex(edge) not in {to_hex(words) for words in again.loop_closure_edges.id}
 
 
 def test_a_repeated_search_replaces_the_edges() -> None:
     vi_map, report = closed()
-    again, second = close_cloud_loops(vi_map, Path(), OPTIONS)
+    again, second = workflow.close_cloud_loops(vi_map, Path(), OPTIONS)
     assert second == report
     np.testing.assert_array_equal(again.loop_closure_edges.id, vi_map.loop_closure_edges.id)
     np.testing.assert_array_equal(again.loop_closure_edges.T_A_B, vi_map.loop_closure_edges.T_A_B)
@@ -274,7 +258,7 @@ def test_a_repeated_search_replaces_the_edges() -> None:
 def test_recorded_closures_name_the_pairs() -> None:
     vi_map, _ = closed()
     options = dataclasses.replace(OPTIONS, from_closures=True, every_nth=2)
-    again, report = close_cloud_loops(vi_map, Path(), options)
+    again, report = workflow.close_cloud_loops(vi_map, Path(), options)
     assert 0 < report.accepted <= report.pairs
     off_m, _ = edge_errors(again, simulated(SHORT).truth)
     assert off_m.max() < 0.05
@@ -289,7 +273,7 @@ def test_strict_gates_refuse_and_say_so() -> None:
         (dataclasses.replace(OPTIONS, min_support=500), "no closures nearby agree"),
     ):
         few = dataclasses.replace(options, every_nth=3)
-        unchanged, report = close_cloud_loops(vi_map, Path(), few)
+        unchanged, report = workflow.close_cloud_loops(vi_map, Path(), few)
         assert report.refused.keys() == {reason}
         assert reason in report.failure
         assert not len(unchanged.loop_closure_edges)
@@ -299,22 +283,24 @@ def test_maps_without_clouds_or_pairs() -> None:
     vi_map = simulated(SHORT).maps[0]
     bare = without_resources(vi_map, np.ones(len(vi_map.resources), dtype=np.bool_))
     with pytest.raises(UserError, match="import_point_clouds"):
-        close_cloud_loops(bare, Path(), OPTIONS)
+        workflow.close_cloud_loops(bare, Path(), OPTIONS)
     with pytest.raises(UserError, match="no accepted closure"):
-        close_cloud_loops(vi_map, Path(), dataclasses.replace(OPTIONS, from_closures=True))
+        workflow.close_cloud_loops(vi_map, Path(), dataclasses.replace(OPTIONS, from_closures=True))
     late = dataclasses.replace(OPTIONS, min_time_gap_s=100.0, sequence_gap_s=0.0)
-    assert "--lidar_lc_min_time_gap_s" in close_cloud_loops(vi_map, Path(), late)[1].failure
+    assert (
+        "--lidar_lc_min_time_gap_s" in workflow.close_cloud_loops(vi_map, Path(), late)[1].failure
+    )
     with pytest.raises(FlagError, match="exclude each other"):
         CloudClosureOptions(search_globally=True, from_closures=True)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("world", "motion"), [(TWO_ROOMS, TOUR), (CORRIDOR, WALK)])
-def test_no_wrong_edges_over_seeds(world: WorldOptions, motion: SessionOptions) -> None:
+def test_no_wrong_edges_over_seeds(world: sim.WorldOptions, motion: sim.SessionOptions) -> None:
     edges = 0
     for seed in range(6):
         data = simulate(session(world, motion, rate_hz=0.35, seed=seed))
-        vi_map, report = close_cloud_loops(data.maps[0], Path(), OPTIONS)
+        vi_map, report = workflow.close_cloud_loops(data.maps[0], Path(), OPTIONS)
         off_m, off_deg = edge_errors(vi_map, data.truth)
         assert off_m.max(initial=0.0) < 0.1
         assert off_deg.max(initial=0.0) < 1.0
@@ -324,9 +310,11 @@ def test_no_wrong_edges_over_seeds(world: WorldOptions, motion: SessionOptions) 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("world", "motion"), [(TWO_ROOMS, TOUR), (CORRIDOR, WALK)])
-def test_a_drifting_minute_is_straightened(world: WorldOptions, motion: SessionOptions) -> None:
+def test_a_drifting_minute_is_straightened(
+    world: sim.WorldOptions, motion: sim.SessionOptions
+) -> None:
     data = simulate(session(world, motion, rate_hz=1.0))
-    vi_map, _ = close_cloud_loops(data.maps[0], Path(), OPTIONS)
+    vi_map, _ = workflow.close_cloud_loops(data.maps[0], Path(), OPTIONS)
     relaxed, _ = relax(vi_map, RelaxationOptions())
     before = evaluate_map(data.maps[0], data.truth).ate_m
     assert evaluate_map(relaxed, data.truth).ate_m <= 0.25 * before
@@ -337,8 +325,8 @@ def test_clouds_in_sequence_limit_the_drift_where_no_loop_closes() -> None:
     once = session(ROOM, dataclasses.replace(AROUND, duration_s=9.0, turns=0.5), rate_hz=2.0)
     data = simulated(once)
     alone = dataclasses.replace(OPTIONS, sequence_gap_s=0.0)
-    assert not len(close_cloud_loops(data.maps[0], Path(), alone)[0].loop_closure_edges)
-    vi_map, report = close_cloud_loops(data.maps[0], Path(), OPTIONS)
+    assert not len(workflow.close_cloud_loops(data.maps[0], Path(), alone)[0].loop_closure_edges)
+    vi_map, report = workflow.close_cloud_loops(data.maps[0], Path(), OPTIONS)
     edges = vi_map.loop_closure_edges
     stamp_ns = vi_map.vertices.timestamp_ns
     gap_s = (stamp_ns[edges.from_vertex] - stamp_ns[edges.to_vertex]) * 1e-9

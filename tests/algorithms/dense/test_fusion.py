@@ -7,17 +7,9 @@ import numba
 import numpy as np
 import pytest
 
+from maplab_py.algorithms.dense import fusion
 from maplab_py.algorithms.dense.clouds import convert_depth_maps
 from maplab_py.algorithms.dense.field import create_fields
-from maplab_py.algorithms.dense.fusion import (
-    FusedDepth,
-    StoredGrid,
-    decode_grid,
-    encode_grid,
-    fuse_depth,
-    load_grids,
-    update_grids,
-)
 from maplab_py.algorithms.dense.grid import GridSettings, Mesh, TsdfGrid
 from maplab_py.algorithms.dense.meshing import map_mesh
 from maplab_py.algorithms.dense.options import FusionOptions
@@ -59,7 +51,7 @@ def distances(room: StereoRoom, vi_map: VIMap, min_weight: float = 0.1) -> F64:
 
 
 def test_true_depth_gives_the_true_surfaces(room: StereoRoom, with_depth: VIMap) -> None:
-    fused, report = fuse_depth(with_depth, Path(), None, FusionOptions(voxel_size_m=0.05))
+    fused, report = fusion.fuse_depth(with_depth, Path(), None, FusionOptions(voxel_size_m=0.05))
     assert report.resource_type == "raw_depth_maps"
     assert report.grids[0].added == len(with_depth.vertices)
     off_m = distances(room, fused)
@@ -74,14 +66,14 @@ def test_voxels_that_are_coarse_for_a_near_scene_are_told(
 ) -> None:
     for voxel_m, is_told in ((0.05, False), (0.5, True)):
         options = FusionOptions(voxel_size_m=voxel_m, integrate_every_nth=10)
-        _, report = fuse_depth(with_depth, room.map_folder, options=options)
+        _, report = fusion.fuse_depth(with_depth, room.map_folder, options=options)
         assert (
             any(f"voxels of {voxel_m:g} m are coarse" in note for note in report.notes) == is_told
         )
 
 
 def test_the_grid_moves_with_its_mission(room: StereoRoom, with_depth: VIMap) -> None:
-    fused, _ = fuse_depth(with_depth, Path(), None, OPTIONS)
+    fused, _ = fusion.fuse_depth(with_depth, Path(), None, OPTIONS)
     before, _ = map_mesh(fused, Path(), None, 0.1)
     T_G_M = np.array(fused.baseframes.T_G_M)
     T_G_M[:, 4:] += [3.0, -2.0, 1.0]
@@ -92,9 +84,9 @@ def test_the_grid_moves_with_its_mission(room: StereoRoom, with_depth: VIMap) ->
 
 def test_clouds_of_cameras_fuse_as_their_depth_maps_do(room: StereoRoom, with_depth: VIMap) -> None:
     clouds, _ = convert_depth_maps(with_depth, Path())
-    fused, report = fuse_depth(clouds, Path(), None, OPTIONS, input_type=16)
+    fused, report = fusion.fuse_depth(clouds, Path(), None, OPTIONS, input_type=16)
     assert report.resource_type == "point_cloud"
-    expected, _ = fuse_depth(with_depth, Path(), None, OPTIONS)
+    expected, _ = fusion.fuse_depth(with_depth, Path(), None, OPTIONS)
     mesh, same = map_mesh(fused, Path())[0], map_mesh(expected, Path())[0]
     assert abs(len(mesh.p) - len(same.p)) < 0.01 * len(same.p)
     assert distances(room, fused).mean() < 1.1 * distances(room, expected).mean() + 1e-4
@@ -102,13 +94,13 @@ def test_clouds_of_cameras_fuse_as_their_depth_maps_do(room: StereoRoom, with_de
 
 def test_an_update_gives_what_fusing_again_gives(with_depth: VIMap) -> None:
     wrong = moved(with_depth, slice(3, 8), 0.2)
-    fused, _ = fuse_depth(wrong, Path(), None, OPTIONS)
+    fused, _ = fusion.fuse_depth(wrong, Path(), None, OPTIONS)
     right = moved(fused, slice(3, 8), -0.2)
-    updated, report = update_grids(right, Path())
+    updated, report = fusion.update_grids(right, Path())
     assert (report.grids[0].added, report.grids[0].removed) == (5, 5)
     (_, stored), (_, direct) = (
-        load_grids(vi_map, Path())[0]
-        for vi_map in (updated, fuse_depth(with_depth, Path(), None, OPTIONS)[0])
+        fusion.load_grids(vi_map, Path())[0]
+        for vi_map in (updated, fusion.fuse_depth(with_depth, Path(), None, OPTIONS)[0])
     )
     np.testing.assert_allclose(stored.fused.T_M_C, direct.fused.T_M_C, atol=1e-12)
     rows = {tuple(c): row for row, c in enumerate(stored.grid.coordinates.tolist())}
@@ -118,22 +110,22 @@ def test_an_update_gives_what_fusing_again_gives(with_depth: VIMap) -> None:
     difference = (stored.grid.distance[same] - direct.grid.distance)[strong]
     assert np.abs(difference).max() < 1e-3
     assert len(updated.resources) == len(fused.resources)
-    again, report = update_grids(updated, Path())
+    again, report = fusion.update_grids(updated, Path())
     assert again is updated
     assert report.grids[0].added == 0
 
 
 def test_small_motion_is_left_alone(with_depth: VIMap) -> None:
-    fused, _ = fuse_depth(with_depth, Path(), None, OPTIONS)
+    fused, _ = fusion.fuse_depth(with_depth, Path(), None, OPTIONS)
     shifted = moved(fused, slice(0, 4), 0.02)
-    assert update_grids(shifted, Path(), threshold_m=0.05)[0] is shifted
-    _, report = update_grids(shifted, Path(), threshold_m=0.01)
+    assert fusion.update_grids(shifted, Path(), threshold_m=0.05)[0] is shifted
+    _, report = fusion.update_grids(shifted, Path(), threshold_m=0.01)
     assert report.grids[0].added == 4
 
 
 def test_missions_in_unknown_frames_have_their_own_grids(with_depth: VIMap) -> None:
     both, _ = merge_maps(with_depth, with_depth, assign_new_ids=True)
-    apart, report = fuse_depth(both, Path(), None, OPTIONS)
+    apart, report = fusion.fuse_depth(both, Path(), None, OPTIONS)
     assert [grid.missions for grid in report.grids] == [1, 1]
     assert "unknown base frames" in report.notes[0]
     assert (apart.resources.owner_kind[resources_of(apart, (18,))] == ResourceOwner.MISSION).all()
@@ -143,32 +135,32 @@ def test_missions_in_unknown_frames_have_their_own_grids(with_depth: VIMap) -> N
     known = both.replace(
         baseframes=both.baseframes.replace(is_known=np.ones(len(both.baseframes), dtype=bool))
     )
-    together, report = fuse_depth(known, Path(), None, OPTIONS)
+    together, report = fusion.fuse_depth(known, Path(), None, OPTIONS)
     assert [grid.missions for grid in report.grids] == [2]
     assert report.grids[0].depth_maps == 2 * len(with_depth.vertices)
     assert np.count_nonzero(resources_of(together, (18,))) == 1
-    assert update_grids(together, Path())[0] is together
+    assert fusion.update_grids(together, Path())[0] is together
 
 
 def test_bad_input_is_refused(room: StereoRoom, with_depth: VIMap) -> None:
     with pytest.raises(UserError, match="stereo_dense_reconstruction"):
-        fuse_depth(room.true_map, Path())
+        fusion.fuse_depth(room.true_map, Path())
     with pytest.raises(UserError, match="have no optimized_depth_maps"):
-        fuse_depth(with_depth, Path(), input_type=9)
+        fusion.fuse_depth(with_depth, Path(), input_type=9)
     with pytest.raises(UserError, match="wants one of 8, 9, 16"):
-        fuse_depth(with_depth, Path(), input_type=0)
-    for function in (update_grids, map_mesh):
+        fusion.fuse_depth(with_depth, Path(), input_type=0)
+    for function in (fusion.update_grids, map_mesh):
         with pytest.raises(UserError, match="create_tsdf_from_depth_resource makes one"):
             function(with_depth, Path())
-    fused, _ = fuse_depth(with_depth, Path(), None, OPTIONS)
+    fused, _ = fusion.fuse_depth(with_depth, Path(), None, OPTIONS)
     with pytest.raises(UserError, match=r"--overwrite.*--update"):
-        fuse_depth(fused, Path(), None, OPTIONS)
-    replaced, _ = fuse_depth(fused, Path(), None, OPTIONS, overwrite=True)
+        fusion.fuse_depth(fused, Path(), None, OPTIONS)
+    replaced, _ = fusion.fuse_depth(fused, Path(), None, OPTIONS, overwrite=True)
     np.testing.assert_array_equal(replaced.resources.id, fused.resources.id)
     with pytest.raises(EstimationError, match="--dense_tsdf_mesh_min_weight"):
         map_mesh(fused, Path(), None, 1e9)
     with pytest.raises(MapError, match="depth maps of the grid are not in the map"):
-        update_grids(without_resources(fused, resources_of(fused, (8,))), Path())
+        fusion.update_grids(without_resources(fused, resources_of(fused, (8,))), Path())
 
 
 def test_grids_of_other_programs_are_refused(with_depth: VIMap) -> None:
@@ -197,7 +189,7 @@ def test_clouds_without_depth_are_refused_in_one_line(
 ) -> None:
     new = NewResources()
     vi_map = new.attached(room.true_map, [new.add(16, content)], [0])
-    for function in (fuse_depth, create_fields):
+    for function in (fusion.fuse_depth, create_fields):
         with pytest.raises(error, match=message) as raised:
             function(vi_map, Path())
         assert "\n" not in str(raised.value)
@@ -206,7 +198,7 @@ def test_clouds_without_depth_are_refused_in_one_line(
 def test_depth_maps_of_another_size_are_refused(room: StereoRoom) -> None:
     new = NewResources()
     vi_map = new.attached(room.true_map, [new.add_image(np.ones((24, 32), np.uint16), 8)], [0])
-    for function in (fuse_depth, create_fields):
+    for function in (fusion.fuse_depth, create_fields):
         with pytest.raises(MapError, match="32 x 24 pixels, the images of its camera 376 x 240"):
             function(vi_map, Path())
 
@@ -351,18 +343,18 @@ def test_a_depth_map_that_is_taken_out_leaves_no_trace() -> None:
             np.testing.assert_allclose(difference, 0.0, atol=1e-4)
 
 
-def stored_sphere() -> StoredGrid:
-    fused = FusedDepth(np.array([[1, 2], [3, 4]], dtype=np.uint64), np.ones((2, 7)))
-    return StoredGrid(sphere_grid(), fused)
+def stored_sphere() -> fusion.StoredGrid:
+    fused = fusion.FusedDepth(np.array([[1, 2], [3, 4]], dtype=np.uint64), np.ones((2, 7)))
+    return fusion.StoredGrid(sphere_grid(), fused)
 
 
 def test_a_grid_file_holds_everything() -> None:
     stored = stored_sphere()
-    data = encode_grid(stored)
-    loaded = decode_grid(data, "grid")
+    data = fusion.encode_grid(stored)
+    loaded = fusion.decode_grid(data, "grid")
     assert loaded.grid.settings == SETTINGS
     np.testing.assert_array_equal(loaded.fused.resource_id, stored.fused.resource_id)
-    assert encode_grid(loaded) == data
+    assert fusion.encode_grid(loaded) == data
     mesh, again = stored.grid.sorted().mesh(0.1), loaded.grid.mesh(0.1)
     assert mesh.p.tobytes() == again.p.tobytes()
     assert mesh.faces.tobytes() == again.faces.tobytes()
@@ -382,9 +374,9 @@ def test_a_grid_file_holds_everything() -> None:
     ],
 )
 def test_damaged_files_are_refused(damage: object, message: str) -> None:
-    data = damage(encode_grid(stored_sphere()))  # type: ignore[operator]
+    data = damage(fusion.encode_grid(stored_sphere()))  # type: ignore[operator]
     with pytest.raises(MapError, match=message) as error:
-        decode_grid(data, "grid 7")
+        fusion.decode_grid(data, "grid 7")
     assert str(error.value).startswith("grid 7: ")
 
 

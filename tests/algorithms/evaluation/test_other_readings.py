@@ -5,12 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
+from maplab_py.algorithms.evaluation import plausibility
 from maplab_py.algorithms.evaluation.options import TrajectoryEvaluationOptions
-from maplab_py.algorithms.evaluation.plausibility import (
-    clock_offset_ns,
-    motion_hint,
-    orientation_hint,
-)
 from maplab_py.algorithms.evaluation.trajectory_evaluation import evaluate_trajectory
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3
@@ -58,18 +54,18 @@ def test_right_orders_and_mounted_bodies_get_no_hint() -> None:
 def test_an_order_is_found_beside_a_constant_rotation() -> None:
     q = orientations()
     wrong = np.roll(so3.multiply(q, so3.exp([0.3, 2.0, 0.5])), 1, axis=1)
-    assert "qw first would give" in orientation_hint(wrong, q)
-    assert "beside a constant rotation" in orientation_hint(wrong, q)
-    assert orientation_hint(wrong, q, is_mounted=True) == ""
+    assert "qw first would give" in plausibility.orientation_hint(wrong, q)
+    assert "beside a constant rotation" in plausibility.orientation_hint(wrong, q)
+    assert plausibility.orientation_hint(wrong, q, is_mounted=True) == ""
 
 
 def test_motions_name_the_order_in_any_frame() -> None:
     q = orientations()
     other = so3.multiply(so3.exp([0.0, 0.0, 1.0]), q)
-    apart_deg, hint = motion_hint(np.roll(other, 1, axis=1), q)
+    apart_deg, hint = plausibility.motion_hint(np.roll(other, 1, axis=1), q)
     assert apart_deg > 10.0
     assert "qw first" in hint
-    assert motion_hint(other, q)[1] == ""
+    assert plausibility.motion_hint(other, q)[1] == ""
 
 
 @pytest.mark.parametrize("offset_s", [0.35, -2.0])
@@ -127,7 +123,7 @@ def test_offsets_without_overlap_are_never_the_best(seed: int) -> None:
     truth = make_truth(1200 + 7 * seed)
     T = se3.make(truth.T_R_B[:, :4], truth.T_R_B[:, 4:] + rng.normal(size=(len(truth), 3)) * 1e-3)
     shift_ns = 250_000_000
-    found = clock_offset_ns(
+    found = plausibility.clock_offset_ns(
         truth.times_ns - shift_ns,
         T,
         truth.times_ns,

@@ -8,16 +8,8 @@ import pytest
 from maplab_py.algorithms.gate import any_failed
 from maplab_py.algorithms.keyframing.heuristic import keyframe
 from maplab_py.algorithms.keyframing.options import KeyframingOptions
+from maplab_py.algorithms.landmarks import quality
 from maplab_py.algorithms.landmarks.options import InvalidObservationOptions, LandmarkQualityOptions
-from maplab_py.algorithms.landmarks.quality import (
-    criteria,
-    evaluate_quality,
-    evaluate_unknown_quality,
-    explain_landmark,
-    mostly_bad,
-    predicted_sigma,
-    reset_quality,
-)
 from maplab_py.algorithms.landmarks.removal import remove_bad, remove_invalid_observations
 from maplab_py.algorithms.landmarks.sightings import rays_in_G
 from maplab_py.algorithms.landmarks.tracks import init_tracks
@@ -52,28 +44,28 @@ def test_retriangulation_restores_every_seen_landmark():
 
 def test_good_needs_observers_angle_and_place():
     m = walk_map()
-    judged, report = evaluate_quality(m, OPTIONS)
+    judged, report = quality.evaluate_quality(m, OPTIONS)
     good = judged.landmarks.quality == LandmarkQuality.GOOD
     assert 0 < report.good < len(m.landmarks)
     assert np.all(np.diff(m.observation_start)[good] >= 10)
     row = int(np.flatnonzero(good)[0])
     behind = with_p_G(m, [row], 2.0 * m.T_G_M[0, 4:] - m.p_G[[row]] - [0.0, 0.0, 20.0])
-    worse, report_behind = evaluate_quality(behind, OPTIONS)
+    worse, report_behind = quality.evaluate_quality(behind, OPTIONS)
     assert report_behind.good == report.good - 1
     assert report_behind.too_near_or_behind >= 1
     strict = LandmarkQualityOptions(min_observers=10, max_reprojection_error_px=1.0)
-    assert evaluate_quality(disturbed(m, 1.0), strict)[1].too_large_error > 0
-    assert evaluate_quality(m, strict)[1].too_large_error == 0
+    assert quality.evaluate_quality(disturbed(m, 1.0), strict)[1].too_large_error > 0
+    assert quality.evaluate_quality(m, strict)[1].too_large_error == 0
     assert len(worse.landmarks) == len(m.landmarks)
 
 
 def test_bad_landmarks_go_and_quality_can_be_reset():
-    judged, report = evaluate_quality(walk_map(), OPTIONS)
+    judged, report = quality.evaluate_quality(walk_map(), OPTIONS)
     left, removal = remove_bad(judged)
     assert removal.landmarks_removed == report.bad
     assert len(left.landmarks) == report.good
     assert check_consistency(left).errors == ()
-    fresh, after = reset_quality(judged)
+    fresh, after = quality.reset_quality(judged)
     assert after.unknown == len(fresh.landmarks)
     assert not np.any(fresh.landmarks.quality)
 
@@ -133,11 +125,11 @@ def with_two_observers(vi_map: VIMap, *, far_apart: bool) -> tuple[VIMap, np.nda
 
 
 def is_good(vi_map: VIMap, landmarks: np.ndarray, options: LandmarkQualityOptions) -> np.ndarray:
-    return ~any_failed(criteria(vi_map, landmarks, options))
+    return ~any_failed(quality.criteria(vi_map, landmarks, options))
 
 
 def fails(vi_map: VIMap, landmarks: np.ndarray, criterion: str) -> np.ndarray:
-    gates = criteria(vi_map, landmarks, DEFAULT)
+    gates = quality.criteria(vi_map, landmarks, DEFAULT)
     return any_failed([gate for gate in gates if gate.verdict == criterion])
 
 
@@ -179,26 +171,28 @@ def test_more_rays_of_a_narrow_view_count():
     """Eight rays over a few degrees know more than two of them."""
     vi_map, _ = make_map(TWICE)
     pair, landmarks = with_two_observers(vi_map, far_apart=True)
-    assert np.all(predicted_sigma(vi_map, landmarks) < predicted_sigma(pair, landmarks))
+    assert np.all(
+        quality.predicted_sigma(vi_map, landmarks) < quality.predicted_sigma(pair, landmarks)
+    )
 
 
 def test_a_landmark_beside_its_rays_is_uncertain_and_one_wrong_keypoint_does_not_matter():
     vi_map, _ = make_map(TWICE)
     landmarks = np.flatnonzero(np.diff(vi_map.observation_start) >= 8)
-    usual = predicted_sigma(vi_map, landmarks)
+    usual = quality.predicted_sigma(vi_map, landmarks)
     beside = with_p_G(vi_map, landmarks, vi_map.p_G[landmarks] + [0.0, 1.0, 0.0])
-    assert np.all(predicted_sigma(beside, landmarks) > 10.0 * usual)
+    assert np.all(quality.predicted_sigma(beside, landmarks) > 10.0 * usual)
     assert fails(beside, landmarks, "too_uncertain").all()
     uv = vi_map.keypoints.uv_px.copy()
     first = vi_map.observations[vi_map.observation_start[landmarks]]
     uv[first] += 100.0
     wrong = vi_map.replace(keypoints=vi_map.keypoints.replace(uv_px=uv))
-    np.testing.assert_allclose(predicted_sigma(wrong, landmarks), usual, rtol=0.4)
+    np.testing.assert_allclose(quality.predicted_sigma(wrong, landmarks), usual, rtol=0.4)
 
 
 def test_judging_again_keeps_what_merging_has_learned():
     vi_map, _ = make_map([*TWICE[:1], Walk(room=1, mission=1, drift=(0.02, 0.01, 0.0, 0.002))])
-    merged, report = close_loops(reset_quality(vi_map)[0])
+    merged, report = close_loops(quality.reset_quality(vi_map)[0])
     assert report.landmarks_merged > 150
     seen_twice = np.zeros((len(merged.missions), len(merged.landmarks)), dtype=np.bool_)
     observed = merged.observations
@@ -206,22 +200,22 @@ def test_judging_again_keeps_what_merging_has_learned():
     seen_twice[mission, merged.keypoints.landmark[observed]] = True
     both = seen_twice.all(axis=0)
     assert np.all(merged.landmarks.quality[both] == LandmarkQuality.GOOD)
-    again, _ = evaluate_quality(merged, DEFAULT)
+    again, _ = quality.evaluate_quality(merged, DEFAULT)
     assert np.mean(again.landmarks.quality[both] == LandmarkQuality.GOOD) > 0.99
 
 
 def test_a_note_says_why_most_landmarks_are_bad():
     vi_map, _ = make_map(TWICE)
-    assert evaluate_quality(vi_map, DEFAULT)[1].note == ""
-    _, report = evaluate_quality(vi_map, LandmarkQualityOptions(min_observers=100))
+    assert quality.evaluate_quality(vi_map, DEFAULT)[1].note == ""
+    _, report = quality.evaluate_quality(vi_map, LandmarkQualityOptions(min_observers=100))
     assert report.note.startswith(f"{report.bad} of {report.landmarks} landmarks are bad")
     assert f"{report.too_few_observers} with too few observers" in report.note
     poor, _ = with_two_observers(vi_map, far_apart=False)
-    _, notes = evaluate_unknown_quality(reset_quality(poor)[0])
+    _, notes = quality.evaluate_unknown_quality(quality.reset_quality(poor)[0])
     assert "evaluated the quality" in notes[0]
     assert "too uncertain" in notes[1]
-    assert mostly_bad(5, 10, {"too_far": 5}) == ""
-    assert mostly_bad(0, 0, {}) == ""
+    assert quality.mostly_bad(5, 10, {"too_far": 5}) == ""
+    assert quality.mostly_bad(0, 0, {}) == ""
 
 
 def test_keyframing_and_optvi_say_when_they_leave_most_landmarks_bad():
@@ -253,7 +247,9 @@ def test_keypoints_without_deviation_are_taken_as_usual_ones(sigma_px):
     unknown = vi_map.replace(keypoints=vi_map.keypoints.replace(sigma_px=sigma))
     one = vi_map.replace(keypoints=vi_map.keypoints.replace(sigma_px=np.ones(len(sigma))))
     rows = np.arange(len(vi_map.landmarks))
-    np.testing.assert_array_equal(predicted_sigma(unknown, rows), predicted_sigma(one, rows))
+    np.testing.assert_array_equal(
+        quality.predicted_sigma(unknown, rows), quality.predicted_sigma(one, rows)
+    )
 
 
 @pytest.mark.parametrize(
@@ -268,10 +264,10 @@ def test_keypoints_without_deviation_are_taken_as_usual_ones(sigma_px):
 def test_the_explanation_agrees_with_the_verdict(options: LandmarkQualityOptions) -> None:
     vi_map = walk_map()
     rows = np.arange(min(len(vi_map.landmarks), 12))
-    gates = criteria(vi_map, rows, options)
+    gates = quality.criteria(vi_map, rows, options)
     good = ~any_failed(gates)
     for row in rows.tolist():
-        report = explain_landmark(vi_map, row, options)
+        report = quality.explain_landmark(vi_map, row, options)
         results = {c.flag: c.result for c in report.criteria}
         for gate in gates:
             if gate.applies[row]:

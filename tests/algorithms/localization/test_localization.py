@@ -9,30 +9,11 @@ import pytest
 
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
 from maplab_py.algorithms.landmarks.quality import evaluate_quality
+from maplab_py.algorithms.localization import guided, localization
 from maplab_py.algorithms.localization.database import (
     LocalizationMap,
     database_of_map,
     database_of_summary,
-)
-from maplab_py.algorithms.localization.guided import (
-    compile_kernels,
-    guided_matches,
-    landmarks_in_view,
-    least_distances,
-    near_pairs,
-    points_near,
-)
-from maplab_py.algorithms.localization.localization import (
-    Reference,
-    align_robustly,
-    csv_lines,
-    describe,
-    ground_truth,
-    localize_missions,
-    pose_errors,
-    queries,
-    query_vertices,
-    trajectory_of_queries,
 )
 from maplab_py.algorithms.localization.localizer import Localizer, Outcome
 from maplab_py.algorithms.localization.options import LocalizationOptions
@@ -96,14 +77,14 @@ def test_the_map_is_where_it_really_is():
 @pytest.mark.parametrize("kind", ["full", "summary"])
 def test_queries_are_found_where_they_were(kind):
     _, query, _, truth = sessions()
-    found = localize_missions(database(kind), query, OPTIONS)
-    reference = Reference("truth", truth, np.ones(len(truth), dtype=bool))
-    position, orientation = pose_errors(found, reference, se3.identity())
+    found = localization.localize_missions(database(kind), query, OPTIONS)
+    reference = localization.Reference("truth", truth, np.ones(len(truth), dtype=bool))
+    position, orientation = localization.pose_errors(found, reference, se3.identity())
     assert found.is_localized.mean() >= 0.9
     assert np.nanmax(position) < 0.2
     assert np.nanmedian(position) < 0.03
     assert np.nanmedian(orientation) < 0.5
-    report = describe(database(kind), found, reference=reference, T_R_G=se3.identity())
+    report = localization.describe(database(kind), found, reference=reference, T_R_G=se3.identity())
     assert report.map_kind == kind
     assert report.success == report.localized
     assert report.wrong == 0
@@ -112,7 +93,7 @@ def test_queries_are_found_where_they_were(kind):
 
 def test_errors_are_as_large_as_the_covariance_says():
     _, query, _, truth = sessions()
-    found = localize_missions(database("full"), query, OPTIONS)
+    found = localization.localize_missions(database("full"), query, OPTIONS)
     rows = np.flatnonzero(found.is_localized)
     step = se3.local(found.T_G_I[rows], truth[rows])
     covariance = np.array([found.answers[row].covariance for row in rows])
@@ -123,8 +104,10 @@ def test_errors_are_as_large_as_the_covariance_says():
 
 def test_a_sequence_is_localised_as_one_rig():
     _, query, _, truth = sessions()
-    alone = localize_missions(database("summary"), query, OPTIONS)
-    together = localize_missions(database("summary"), query, OPTIONS, sequence_length=4)
+    alone = localization.localize_missions(database("summary"), query, OPTIONS)
+    together = localization.localize_missions(
+        database("summary"), query, OPTIONS, sequence_length=4
+    )
     assert together.is_localized.sum() >= alone.is_localized.sum()
     inliers = [np.median([a.inliers for a in f.answers]) for f in (alone, together)]
     assert inliers[1] > inliers[0]
@@ -135,8 +118,8 @@ def test_a_sequence_is_localised_as_one_rig():
 
 def test_inliers_show_the_landmarks_they_are_matched_with():
     _, query, _, _ = sessions()
-    source = query_vertices(query, np.array([0]), database("full").projection)
-    one = next(iter(queries(source)))
+    source = localization.query_vertices(query, np.array([0]), database("full").projection)
+    one = next(iter(localization.queries(source)))
     answer = Localizer(database("full"), OPTIONS).localize(one)
     assert answer.outcome is Outcome.LOCALIZED
     point_I = se3.transform(se3.inverse(answer.T_G_I), database("full").p_G[answer.landmark])
@@ -149,9 +132,9 @@ def test_inliers_show_the_landmarks_they_are_matched_with():
 
 def test_the_answer_does_not_depend_on_the_other_queries():
     _, query, _, _ = sessions()
-    found = localize_missions(database("full"), query, OPTIONS)
-    source = query_vertices(query, np.array([0]), database("full").projection)
-    last = list(queries(source))[-1]
+    found = localization.localize_missions(database("full"), query, OPTIONS)
+    source = localization.query_vertices(query, np.array([0]), database("full").projection)
+    last = list(localization.queries(source))[-1]
     answer = Localizer(database("full"), OPTIONS).localize(last)
     np.testing.assert_array_equal(answer.T_G_I, found.T_G_I[-1])
 
@@ -162,9 +145,9 @@ def test_an_image_of_another_place_is_refused():
     noise = rng.integers(0, 256, query.keypoints.descriptor.shape)
     strange = query.replace(keypoints=query.keypoints.replace(descriptor=noise))
     for kind in ("full", "summary"):
-        found = localize_missions(database(kind), strange, OPTIONS)
+        found = localization.localize_missions(database(kind), strange, OPTIONS)
         assert not found.is_localized.any()
-        report = describe(database(kind), found)
+        report = localization.describe(database(kind), found)
         assert "none of" in report.failure
         assert sum(report.refused.values()) == len(found.vertex)
 
@@ -175,8 +158,8 @@ def test_true_looks_in_wrong_places_are_refused(kind):
     rng = np.random.default_rng(3)
     _, query, _, _ = sessions()
     localizer = Localizer(database(kind), OPTIONS)
-    source = query_vertices(query, np.array([0]), database(kind).projection)
-    for one in queries(source):
+    source = localization.query_vertices(query, np.array([0]), database(kind).projection)
+    for one in localization.queries(source):
         exchanged = one.descriptors[rng.permutation(len(one.descriptors))]
         answer = localizer.localize(dataclasses.replace(one, descriptors=exchanged))
         assert answer.outcome is not Outcome.LOCALIZED
@@ -185,7 +168,7 @@ def test_true_looks_in_wrong_places_are_refused(kind):
 
 def near(kind, one, T_G_I):
     d = database(kind)
-    return guided_matches(
+    return guided.guided_matches(
         d,
         T_G_I,
         projected=d.projection.project(one.descriptors),
@@ -200,9 +183,9 @@ def near(kind, one, T_G_I):
 @pytest.mark.parametrize("kind", ["full", "summary"])
 def test_a_pose_suggests_matches_near_the_images_of_landmarks(kind):
     _, query, _, truth = sessions()
-    source = query_vertices(query, np.array([0]), database(kind).projection)
+    source = localization.query_vertices(query, np.array([0]), database(kind).projection)
     off_px = []
-    for row, one in enumerate(queries(source)):
+    for row, one in enumerate(localization.queries(source)):
         keypoint, landmark = near(kind, one, truth[row])
         assert np.all(np.diff(keypoint) >= 0)
         assert len(set(zip(keypoint.tolist(), landmark.tolist(), strict=True))) == len(keypoint)
@@ -219,9 +202,9 @@ def test_a_pose_suggests_matches_near_the_images_of_landmarks(kind):
 
 def test_a_wrong_pose_suggests_next_to_nothing():
     _, query, _, truth = sessions()
-    source = query_vertices(query, np.array([0]), database("summary").projection)
+    source = localization.query_vertices(query, np.array([0]), database("summary").projection)
     turned = se3.make(so3.exp([0.0, 0.0, 1.5]), np.zeros(3))
-    for row, one in enumerate(queries(source)):
+    for row, one in enumerate(localization.queries(source)):
         wrong = se3.compose(truth[row], turned)
         right = near("summary", one, truth[row])[0]
         assert len(near("summary", one, wrong)[0]) < 0.1 * len(right)
@@ -246,8 +229,8 @@ def test_a_landmark_is_looked_for_from_where_it_was_seen():
 
 def test_gravity_must_agree():
     _, query, _, _ = sessions()
-    source = query_vertices(query, np.array([0]), database("full").projection)
-    one = next(iter(queries(source)))
+    source = localization.query_vertices(query, np.array([0]), database("full").projection)
+    one = next(iter(localization.queries(source)))
     tilted = dataclasses.replace(one, q_M_I=so3.multiply(so3.exp([0.3, 0.0, 0.0]), one.q_M_I))
     answer = Localizer(database("full"), OPTIONS).localize(tilted)
     assert answer.outcome is not Outcome.LOCALIZED
@@ -255,29 +238,29 @@ def test_gravity_must_agree():
 
 def test_references_align_the_frames():
     vi_map, query, map_truth, truth = sessions()
-    found = localize_missions(database("full"), query, OPTIONS)
+    found = localization.localize_missions(database("full"), query, OPTIONS)
     T_R_G = se3.make(so3.exp([0.1, -0.2, 2.0]), [3.0, -1.0, 0.5])
     times = np.concatenate([vi_map.vertices.timestamp_ns, query.vertices.timestamp_ns])
     poses = se3.compose(T_R_G, np.concatenate([map_truth, truth]))
-    reference, T = ground_truth("recorded", times, poses, query, found, vi_map)
+    reference, T = localization.ground_truth("recorded", times, poses, query, found, vi_map)
     assert T is not None
     np.testing.assert_allclose(T[4:], T_R_G[4:], atol=1e-3)
-    _, from_answers = ground_truth("recorded", times, poses, query, found, None)
+    _, from_answers = localization.ground_truth("recorded", times, poses, query, found, None)
     assert from_answers is not None
-    assert np.nanmedian(pose_errors(found, reference, from_answers)[0]) < 0.03
+    assert np.nanmedian(localization.pose_errors(found, reference, from_answers)[0]) < 0.03
     with pytest.raises(UserError, match="time span"):
-        ground_truth("recorded", times + 10**15, poses, query, found, vi_map)
+        localization.ground_truth("recorded", times + 10**15, poses, query, found, vi_map)
 
 
 def test_an_unknown_base_frame_is_laid_on_the_answers():
     _, query, _, _ = sessions()
-    found = localize_missions(database("full"), query, OPTIONS)
-    reference, T_R_G = trajectory_of_queries(query, found)
+    found = localization.localize_missions(database("full"), query, OPTIONS)
+    reference, T_R_G = localization.trajectory_of_queries(query, found)
     assert not query.baseframes.is_known.any()
     assert T_R_G is not None
-    assert np.nanmedian(pose_errors(found, reference, T_R_G)[0]) < 0.05
+    assert np.nanmedian(localization.pose_errors(found, reference, T_R_G)[0]) < 0.05
     known = query.replace(baseframes=query.baseframes.replace(is_known=[True]))
-    _, T_R_G = trajectory_of_queries(known, found)
+    _, T_R_G = localization.trajectory_of_queries(known, found)
     np.testing.assert_array_equal(T_R_G, se3.identity())
 
 
@@ -288,7 +271,9 @@ def test_a_robust_alignment_ignores_wrong_pairs():
     p_R = se3.transform(T_R_G, p_G)
     p_R[:15] += rng.uniform(3.0, 9.0, (15, 3))
     for level in (True, False):
-        np.testing.assert_allclose(align_robustly(p_R, p_G, level=level), T_R_G, atol=1e-6)
+        np.testing.assert_allclose(
+            localization.align_robustly(p_R, p_G, level=level), T_R_G, atol=1e-6
+        )
 
 
 def test_nonsense_is_refused():
@@ -301,27 +286,29 @@ def test_nonsense_is_refused():
     short = query.keypoints.replace(descriptor=query.keypoints.descriptor[:, :32])
     sizes = query.frames.replace(descriptor_blocks=binary_blocks(query.frames.keypoint_count, 32))
     with pytest.raises(EstimationError, match="32"):
-        localize_missions(database("full"), query.replace(keypoints=short, frames=sizes), OPTIONS)
+        localization.localize_missions(
+            database("full"), query.replace(keypoints=short, frames=sizes), OPTIONS
+        )
 
 
 def test_errors_are_empty_in_the_table_where_the_frames_are_not_aligned():
     query = sessions()[1]
-    answers = localize_missions(database("full"), query, OPTIONS)
-    reference, T_R_G = trajectory_of_queries(query, answers)
+    answers = localization.localize_missions(database("full"), query, OPTIONS)
+    reference, T_R_G = localization.trajectory_of_queries(query, answers)
     assert T_R_G is not None
-    report = describe(database("full"), answers, reference=reference, T_R_G=T_R_G)
+    report = localization.describe(database("full"), answers, reference=reference, T_R_G=T_R_G)
     [heads] = [block.heads for block in blocks_of(report) if isinstance(block, Table)]
     assert heads[1:3] == ["difference [m]", "difference [deg]"]
     of_truth = dataclasses.replace(report, reference="truth")
     [heads] = [block.heads for block in blocks_of(of_truth) if isinstance(block, Table)]
     assert heads[1:3] == ["position error [m]", "orientation error [deg]"]
-    header, *lines = csv_lines(query, answers, reference, T_R_G)
+    header, *lines = localization.csv_lines(query, answers, reference, T_R_G)
     columns = header.strip().split(",")
     error = columns.index("position_error_m")
     assert len(lines) == len(answers.vertex)
     has_error = [line.split(",")[error] != "" for line in lines]
     assert has_error == (answers.is_localized & reference.is_known).tolist()
-    for line in csv_lines(query, answers, reference, None)[1:]:
+    for line in localization.csv_lines(query, answers, reference, None)[1:]:
         assert len(line.split(",")) == len(columns)
         assert line.split(",")[error] == ""
 
@@ -391,7 +378,7 @@ def test_it_returns_all_similar_pairs_near_the_pose(kind: str, cameras: int) -> 
             distance = np.sum(step * step, axis=2)
         # the same limit for both kinds
         scale = LIMIT / (LIMIT if database.has_descriptors else float(np.median(distance)))
-        keypoint, landmark = guided_matches(
+        keypoint, landmark = guided.guided_matches(
             database, T_G_I, projected=described.projected, words=described.words,
             origin_I=origin_I, ray_I=seen.ray_I, radius_rad=radius, max_distance=LIMIT / scale,
         )  # fmt: skip
@@ -405,20 +392,20 @@ def test_it_returns_all_similar_pairs_near_the_pose(kind: str, cameras: int) -> 
 def test_pairs_are_all_returned_however_many_they_are() -> None:
     ray, toward = np.tile([[0.0, 0.0, 1.0]], (3, 1)), np.tile([[0.0, 0.0, 1.0]], (200, 1))
     first: I64 = np.zeros(3, dtype=np.int64)
-    key, point = near_pairs(ray, np.full(3, 0.9), first, first + 200, toward)
+    key, point = guided.near_pairs(ray, np.full(3, 0.9), first, first + 200, toward)
     np.testing.assert_array_equal(key, np.repeat(np.arange(3), 200))
     np.testing.assert_array_equal(point, np.tile(np.arange(200), 3))
 
 
 def test_nothing_is_compiled_after_the_warmup() -> None:
-    compile_kernels()
-    kernels = (landmarks_in_view, points_near, least_distances)
+    guided.compile_kernels()
+    kernels = (guided.landmarks_in_view, guided.points_near, guided.least_distances)
     before = [list(kernel.signatures) for kernel in kernels]
     assert all(before)
     localizer = Localizer(database_of_summary(summary()), LocalizationOptions())
     seen, T_G_I = frames()[0]
     described = localizer.described(seen.descriptors)
-    guided_matches(
+    guided.guided_matches(
         database_of_summary(summary()), T_G_I, projected=described.projected,
         words=described.words, origin_I=seen.origin_I, ray_I=seen.ray_I,
         radius_rad=RADIUS_PX * seen.rad_per_px, max_distance=1.0,

@@ -7,14 +7,7 @@ import numpy as np
 
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.images import Pixels
-from maplab_py.interop.recordings.protocol import (
-    CameraImage,
-    ImuBatch,
-    Item,
-    PartSpan,
-    RecordedSensors,
-    Recording,
-)
+from maplab_py.interop.recordings import protocol
 from maplab_py.sensors import Camera
 
 
@@ -22,7 +15,7 @@ from maplab_py.sensors import Camera
 class EditedImage:
     """Content of an image whose pixels are changed."""
 
-    plain: CameraImage
+    plain: protocol.CameraImage
     edit: Callable[[Pixels], Pixels]
     encoding: str = "edited"
     bits: int = 8
@@ -41,10 +34,12 @@ class EditedImage:
 class FaultyRecording:
     """A recording whose items and calibration are changed."""
 
-    plain: Recording
-    device: RecordedSensors
+    plain: protocol.Recording
+    device: protocol.RecordedSensors
     edit_imu: Callable[[np.ndarray], np.ndarray] = lambda values: values
-    edit_image: Callable[[int, int, CameraImage], CameraImage | None] | None = None
+    edit_image: Callable[[int, int, protocol.CameraImage], protocol.CameraImage | None] | None = (
+        None
+    )
     imu_shift_ns: int = 0
     repeat_ns: int = 0  # every sample is given again so much later; 0 = it is not
     notes: tuple[str, ...] = ()
@@ -58,22 +53,24 @@ class FaultyRecording:
     def start_ns(self) -> int:
         return self.plain.start_ns + min(self.imu_shift_ns, 0)
 
-    def parts(self) -> tuple[PartSpan, ...]:
+    def parts(self) -> tuple[protocol.PartSpan, ...]:
         return self.plain.parts()
 
-    def items(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Item]:
+    def items(
+        self, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[protocol.Item]:
         """Yield the changed items in the order of time."""
         imu, others = [], []
         counts = [0] * len(self.device.cameras)
         for item in self.plain.items():
-            if isinstance(item, ImuBatch):
+            if isinstance(item, protocol.ImuBatch):
                 values, times_ns = self.edit_imu(item.accel_gyro.copy()), item.times_ns
                 is_saturated = item.is_saturated
                 if self.repeat_ns:
                     times_ns = (times_ns[:, None] + [0, self.repeat_ns]).ravel()
                     values, is_saturated = (np.repeat(c, 2, axis=0) for c in (values, is_saturated))
-                imu.append(ImuBatch(times_ns + self.imu_shift_ns, values, is_saturated))
-            elif isinstance(item, CameraImage) and self.edit_image is not None:
+                imu.append(protocol.ImuBatch(times_ns + self.imu_shift_ns, values, is_saturated))
+            elif isinstance(item, protocol.CameraImage) and self.edit_image is not None:
                 edited = self.edit_image(item.camera, counts[item.camera], item)
                 counts[item.camera] += 1
                 others += [edited] if edited is not None else []
@@ -87,11 +84,11 @@ class FaultyRecording:
                 yield item
 
 
-def sound(recording: Recording) -> FaultyRecording:
+def sound(recording: protocol.Recording) -> FaultyRecording:
     return FaultyRecording(recording, recording.device)
 
 
-def with_imu(recording: Recording, accel: np.ndarray, gyro: np.ndarray) -> FaultyRecording:
+def with_imu(recording: protocol.Recording, accel: np.ndarray, gyro: np.ndarray) -> FaultyRecording:
     """Multiply accelerations and rates by matrices (3, 3)."""
 
     def edit(values: np.ndarray) -> np.ndarray:
@@ -100,12 +97,12 @@ def with_imu(recording: Recording, accel: np.ndarray, gyro: np.ndarray) -> Fault
     return dataclasses.replace(sound(recording), edit_imu=edit)
 
 
-def with_clock(recording: Recording, shift_s: float) -> FaultyRecording:
+def with_clock(recording: protocol.Recording, shift_s: float) -> FaultyRecording:
     """Let the IMU's stamps be later."""
     return dataclasses.replace(sound(recording), imu_shift_ns=round(shift_s * 1e9))
 
 
-def with_noise_figures(recording: Recording, accel: float, gyro: float) -> FaultyRecording:
+def with_noise_figures(recording: protocol.Recording, accel: float, gyro: float) -> FaultyRecording:
     """Multiply the noise densities of the calibration."""
     imu = recording.device.imu
     assert imu is not None
@@ -118,7 +115,7 @@ def with_noise_figures(recording: Recording, accel: float, gyro: float) -> Fault
 
 
 def with_rig(
-    recording: Recording,
+    recording: protocol.Recording,
     *,
     turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0),
     move_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
@@ -141,20 +138,20 @@ def with_rig(
     return FaultyRecording(recording, dataclasses.replace(device, sensors=sensors))
 
 
-def with_pixels(recording: Recording, edit: Callable[[Pixels], Pixels]) -> FaultyRecording:
+def with_pixels(recording: protocol.Recording, edit: Callable[[Pixels], Pixels]) -> FaultyRecording:
     """Change the pixels of all images."""
 
-    def changed(camera: int, count: int, image: CameraImage) -> CameraImage:
+    def changed(camera: int, count: int, image: protocol.CameraImage) -> protocol.CameraImage:
         return dataclasses.replace(image, data=EditedImage(image, edit), bits=8)
 
     return dataclasses.replace(sound(recording), edit_image=changed)
 
 
-def with_repeats(recording: Recording, every: int) -> FaultyRecording:
+def with_repeats(recording: protocol.Recording, every: int) -> FaultyRecording:
     """Show each of every so many images until the next; 0 = the first for ever."""
-    kept: dict[int, CameraImage] = {}
+    kept: dict[int, protocol.CameraImage] = {}
 
-    def changed(camera: int, count: int, image: CameraImage) -> CameraImage:
+    def changed(camera: int, count: int, image: protocol.CameraImage) -> protocol.CameraImage:
         if count == 0 or (every and count % every == 0):
             kept[camera] = image
         return dataclasses.replace(image, data=kept[camera].data)
@@ -162,10 +159,10 @@ def with_repeats(recording: Recording, every: int) -> FaultyRecording:
     return dataclasses.replace(sound(recording), edit_image=changed)
 
 
-def with_swapped_images(recording: Recording) -> FaultyRecording:
+def with_swapped_images(recording: protocol.Recording) -> FaultyRecording:
     """Exchange the images of the first two cameras."""
 
-    def changed(camera: int, count: int, image: CameraImage) -> CameraImage:
+    def changed(camera: int, count: int, image: protocol.CameraImage) -> protocol.CameraImage:
         return dataclasses.replace(image, camera=1 - camera)
 
     return dataclasses.replace(sound(recording), edit_image=changed)

@@ -8,15 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
+from maplab_py.algorithms.recording_check import doctor
 from maplab_py.algorithms.recording_check.correction import correct
-from maplab_py.algorithms.recording_check.doctor import (
-    check_first_seconds,
-    check_map,
-    diagnose,
-    explain_refusal,
-    first_cause,
-    report,
-)
 from maplab_py.algorithms.recording_check.findings import Finding, Verdict, cause
 from maplab_py.algorithms.recording_check.image_checks import check_images
 from maplab_py.algorithms.recording_check.image_samples import CameraSampler, PointPairs
@@ -289,16 +282,16 @@ def mission() -> MapRecording:
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_planted_fault_is_named_first_with_its_remedy(name: str):
     plant, check, word = FAULTS[name]
-    first = first_cause(diagnose(plant(mission())))
+    first = doctor.first_cause(doctor.diagnose(plant(mission())))
     assert first is not None
     assert first.check.startswith(check)
     assert word in first.line
 
 
 def test_nothing_is_wrong_with_a_sound_mission():
-    diagnosis = diagnose(mission())
+    diagnosis = doctor.diagnose(mission())
     assert [f for f in diagnosis.findings if f.verdict in (Verdict.WRONG, Verdict.HOPELESS)] == []
-    checked = report(diagnosis, mission())
+    checked = doctor.report(diagnosis, mission())
     assert not checked.failure
     assert "rovioli" in checked.advice
     assert len({finding.check for finding in checked.findings}) == len(checked.findings)
@@ -306,57 +299,57 @@ def test_nothing_is_wrong_with_a_sound_mission():
 
 def test_a_corrected_calibration_passes_the_check():
     wrong = faults.with_rig(faults.with_clock(mission(), 0.02), turn_deg=(0.0, 8.0, 0.0))
-    diagnosis = diagnose(wrong)
+    diagnosis = doctor.diagnose(wrong)
     corrected = correct(diagnosis)
     assert any("time offset 20" in note for note in corrected.notes)
     offset_ns = corrected.device.cameras[0].time_offset_ns
     mended = dataclasses.replace(
         wrong, device=corrected.device, imu_shift_ns=wrong.imu_shift_ns - offset_ns
     )
-    assert first_cause(diagnose(mended)) is None
+    assert doctor.first_cause(doctor.diagnose(mended)) is None
 
 
 def test_units_are_told_but_not_put_into_the_calibration():
     device = mission().device
-    corrected = correct(diagnose(faults.with_imu(mission(), EYE, np.degrees(EYE))))
+    corrected = correct(doctor.diagnose(faults.with_imu(mission(), EYE, np.degrees(EYE))))
     assert "not of the calibration: unit of the gyroscope" in corrected.notes[0]
     np.testing.assert_array_equal(corrected.device.T_I_C, device.T_I_C)
-    assert correct(diagnose(mission())).notes == ("nothing to correct",)
+    assert correct(doctor.diagnose(mission())).notes == ("nothing to correct",)
 
 
 def test_the_first_seconds_are_refused_noted_or_passed():
     stream = StreamOptions()
-    assert check_first_seconds(mission(), stream) == ()
+    assert doctor.check_first_seconds(mission(), stream) == ()
     with pytest.raises(UserError, match=r"no time in common.*--time_unit"):
-        check_first_seconds(faults.with_clock(mission(), 3600.0), stream)
-    lines = check_first_seconds(faults.with_imu(mission(), EYE / 9.81, EYE), stream)
+        doctor.check_first_seconds(faults.with_clock(mission(), 3600.0), stream)
+    lines = doctor.check_first_seconds(faults.with_imu(mission(), EYE / 9.81, EYE), stream)
     assert len(lines) == 1
     assert "unit of the accelerometer" in lines[0]
 
 
 def test_a_refused_start_is_explained_by_its_cause():
-    assert explain_refusal(diagnose(mission()), "walk", "move more") == "move more"
-    assert explain_refusal(None, "walk", "move more") == "move more"
-    wrong = diagnose(faults.with_imu(mission(), EYE, np.degrees(EYE)))
-    reason = explain_refusal(wrong, "walk", "move more")
+    assert doctor.explain_refusal(doctor.diagnose(mission()), "walk", "move more") == "move more"
+    assert doctor.explain_refusal(None, "walk", "move more") == "move more"
+    wrong = doctor.diagnose(faults.with_imu(mission(), EYE, np.degrees(EYE)))
+    reason = doctor.explain_refusal(wrong, "walk", "move more")
     assert "walk: the odometry has not started: unit of the gyroscope" in reason
 
 
 def test_a_map_tells_what_contradicts_its_calibration():
     vi_map, device = replayed(MOTION)[0], mission().device
-    assert check_map(vi_map) == ()
+    assert doctor.check_map(vi_map) == ()
     turned = faults.with_rig(mission(), turn_deg=(0.0, 8.0, 0.0)).device
-    found = check_map(vi_map.replace(sensors=turned.sensors))[0]
+    found = doctor.check_map(vi_map.replace(sensors=turned.sensors))[0]
     assert found.check.startswith("rotation of the extrinsics")
     assert "--vio_estimate=extrinsics" in found.remedy
     alone = dataclasses.replace(device.sensors, sensors={device.rig_id: device.rig})
-    assert check_map(vi_map.replace(sensors=alone)) == ()
+    assert doctor.check_map(vi_map.replace(sensors=alone)) == ()
 
 
 def test_a_recording_without_imu_cannot_work():
     plain = mission()
     none = dataclasses.replace(faults.sound(plain), edit_imu=lambda values: 0.0 * values)
-    first = first_cause(diagnose(none))
+    first = doctor.first_cause(doctor.diagnose(none))
     assert first is not None
     assert first.verdict is Verdict.HOPELESS
     assert "--imu_topic" in first.remedy
@@ -369,9 +362,9 @@ def test_units_axes_clock_and_mounting_are_mended_together() -> None:
     axes = faults.AXES["swap xy"]
     wrong = faults.with_imu(mission(), EYE / 9.81, np.degrees(axes))
     wrong = faults.with_rig(faults.with_clock(wrong, 0.02), turn_deg=(0.0, 6.0, 0.0))
-    read = mended(wrong, diagnose(wrong), STREAM)
+    read = mended(wrong, doctor.diagnose(wrong), STREAM)
     assert read is not None
-    assert first_cause(diagnose(read)) is None
+    assert doctor.first_cause(doctor.diagnose(read)) is None
     np.testing.assert_allclose(read.accel, 9.81 * EYE)
     np.testing.assert_allclose(read.gyro, np.radians(axes), atol=1e-12)
     off = np.abs(se3.local(mission().device.T_I_C, read.device.T_I_C))[:, 3:]
@@ -382,7 +375,7 @@ def test_units_axes_clock_and_mounting_are_mended_together() -> None:
 
 def test_a_sound_recording_and_a_hopeless_one_stay() -> None:
     for recording in (mission(), faults.with_clock(mission(), 3600.0)):
-        assert mended(recording, diagnose(recording), STREAM) is None
+        assert mended(recording, doctor.diagnose(recording), STREAM) is None
 
 
 def test_a_run_that_is_lost_is_mended_or_noted() -> None:
@@ -407,7 +400,7 @@ def test_a_map_that_contradicts_its_calibration_is_made_again() -> None:
     plain = Mapping(wrong)
     plain.run()
     assert plain.builder is not None
-    found = check_map(plain.builder.make_map())
+    found = doctor.check_map(plain.builder.make_map())
     assert found[0].check == "rotation of the extrinsics, camera 0"
     for is_repeatable in (True, False):
         mapping = run_checked(Mapping, wrong, is_repeatable=is_repeatable)

@@ -10,14 +10,8 @@ from maplab_py.algorithms.vi_optimization.optimization import contradicted_calib
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import CameraRig
+from maplab_py.simulation import scenario as sim
 from maplab_py.simulation.evaluation import evaluate_map
-from maplab_py.simulation.scenario import (
-    CameraOptions,
-    MeasurementOptions,
-    Scenario,
-    SessionOptions,
-    WorldOptions,
-)
 from maplab_py.simulation.simulate import SimulatedData, simulate
 from maplab_py.vimap import MissionSensor, VIMap
 from maplab_py.vimap.tables import AbsolutePoses
@@ -149,13 +143,13 @@ AUTO = VIOptimizationOptions(calibration="auto")
 FIXED = VIOptimizationOptions()
 
 
-def scenario(line_delay_s: float = 0.0) -> Scenario:
+def scenario(line_delay_s: float = 0.0) -> sim.Scenario:
     return dataclasses.replace(
-        Scenario().with_seed(1),
-        sessions=(SessionOptions(duration_s=10.0),),
-        world=WorldOptions(landmarks_per_room=800),
-        measurement=MeasurementOptions(max_keypoints=150),
-        cameras=(CameraOptions(line_delay_s=line_delay_s),),
+        sim.Scenario().with_seed(1),
+        sessions=(sim.SessionOptions(duration_s=10.0),),
+        world=sim.WorldOptions(landmarks_per_room=800),
+        measurement=sim.MeasurementOptions(max_keypoints=150),
+        cameras=(sim.CameraOptions(line_delay_s=line_delay_s),),
     )
 
 

@@ -13,14 +13,8 @@ from maplab_py.algorithms.vi_optimization.map_problem import build
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.sensors import Camera, CameraRig
+from maplab_py.simulation import scenario as sim
 from maplab_py.simulation.evaluation import evaluate_map
-from maplab_py.simulation.scenario import (
-    CameraOptions,
-    MeasurementOptions,
-    Scenario,
-    SessionOptions,
-    WorldOptions,
-)
 from maplab_py.simulation.simulate import SimulatedData, simulate
 from maplab_py.simulation.truth import true_map
 from maplab_py.storage.native import load_map, save_map
@@ -30,14 +24,14 @@ from tests.support.noiseless import without_noise
 LINE_DELAY_S = 30e-3 / 480
 
 
-def scenario(seed: int, seconds: float, line_delay_s: float = LINE_DELAY_S) -> Scenario:
+def scenario(seed: int, seconds: float, line_delay_s: float = LINE_DELAY_S) -> sim.Scenario:
     """A walk through a room with a camera that reads an image in 30 ms."""
     return dataclasses.replace(
-        Scenario().with_seed(seed),
-        sessions=(SessionOptions(duration_s=seconds),),
-        world=WorldOptions(landmarks_per_room=800),
-        measurement=MeasurementOptions(max_keypoints=150),
-        cameras=(CameraOptions(line_delay_s=line_delay_s),),
+        sim.Scenario().with_seed(seed),
+        sessions=(sim.SessionOptions(duration_s=seconds),),
+        world=sim.WorldOptions(landmarks_per_room=800),
+        measurement=sim.MeasurementOptions(max_keypoints=150),
+        cameras=(sim.CameraOptions(line_delay_s=line_delay_s),),
     )
 
 

@@ -35,25 +35,17 @@ from maplab_py.sensors import Projection
 from maplab_py.sensors.sensors_yaml import write_sensors
 from maplab_py.vimap import LandmarkQuality, VIMap
 from maplab_py.vimap.tables import LoopClosureEdges
-from tests.interop.bags.small_bags import (
-    FORMATS,
-    OFFSET_NS,
-    map_with_resources,
-    messages_of,
-    named,
-    pose_of,
-    with_camera,
-)
+from tests.interop.bags import small_bags
 from tests.interop.recordings.written import frame_sets, make_content, samples, write_bag
 from tests.interop.small_map import PERIOD_NS, VERTICES, make_map
 
 pytest.importorskip("rosbags")
 
 
-@pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize("kind", small_bags.FORMATS)
 def test_rovioli_reads_what_the_map_has(tmp_path: Path, kind: BagFormat) -> None:
-    vi_map, images, _ = map_with_resources()
-    path = named(tmp_path, kind)
+    vi_map, images, _ = small_bags.map_with_resources()
+    path = small_bags.named(tmp_path, kind)
     report = export_bag(vi_map, tmp_path, 0, path, BagExportOptions(format=kind.value))
     assert report.notes == ()
     (tmp_path / "sensors.yaml").write_text(write_sensors(vi_map.sensors))
@@ -66,16 +58,16 @@ def test_rovioli_reads_what_the_map_has(tmp_path: Path, kind: BagFormat) -> None
     sets = frame_sets(events)
     assert [s.time_ns for s in sets] == vi_map.vertices.timestamp_ns[:VERTICES].tolist()
     for frame_set, image in zip(sets, images, strict=True):
-        assert frame_set.images[0].stamp_ns == frame_set.time_ns - OFFSET_NS
+        assert frame_set.images[0].stamp_ns == frame_set.time_ns - small_bags.OFFSET_NS
         np.testing.assert_array_equal(frame_set.images[0].decode(), image)
 
 
-@pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize("kind", small_bags.FORMATS)
 def test_all_topics_read_back(tmp_path: Path, kind: BagFormat) -> None:
-    vi_map, _, clouds = map_with_resources()
-    path = named(tmp_path, kind)
+    vi_map, _, clouds = small_bags.map_with_resources()
+    path = small_bags.named(tmp_path, kind)
     export_bag(vi_map, tmp_path, 0, path, BagExportOptions(format=kind.value))
-    topics = messages_of(path)
+    topics = small_bags.messages_of(path)
     assert {topic: len(messages) for topic, messages in topics.items()} == {
         "/pose": VERTICES,
         "/path": 1,
@@ -120,7 +112,7 @@ def test_only_what_is_asked_for(tmp_path: Path) -> None:
         (t.topic, t.messages) for t in report.topics
     ]
     assert [t.topic for t in info.topics] == ["/imu0", "/pose"]
-    assert messages_of(tmp_path / "walk")["/pose"][0][1].header.frame_id == "office"
+    assert small_bags.messages_of(tmp_path / "walk")["/pose"][0][1].header.frame_id == "office"
     with pytest.raises(FlagError, match="bag_content=imu,pose: wants some of poses"):
         export_bag(make_map(), tmp_path, 1, tmp_path / "b", BagExportOptions(content="imu,pose"))
     options = BagExportOptions(content="images,clouds")
@@ -130,8 +122,8 @@ def test_only_what_is_asked_for(tmp_path: Path) -> None:
 
 
 def test_a_model_without_camera_info_is_told(tmp_path: Path) -> None:
-    vi_map = with_camera(
-        map_with_resources()[0],
+    vi_map = small_bags.with_camera(
+        small_bags.map_with_resources()[0],
         projection=Projection.UNIFIED,
         intrinsics=np.array([0.9, 250.0, 251.0, 320.0, 240.0]),
     )
@@ -141,13 +133,13 @@ def test_a_model_without_camera_info_is_told(tmp_path: Path) -> None:
 
 
 def test_two_sensors_of_the_same_topic_are_refused(tmp_path: Path) -> None:
-    vi_map = with_camera(map_with_resources()[0], topic="imu0")
+    vi_map = small_bags.with_camera(small_bags.map_with_resources()[0], topic="imu0")
     with pytest.raises(UserError, match="two sensors of the mission have the topic /imu0"):
         export_bag(vi_map, tmp_path, 0, tmp_path / "walk.bag")
 
 
 def test_a_missing_image_leaves_no_bag(tmp_path: Path) -> None:
-    vi_map, _, _ = map_with_resources()
+    vi_map, _, _ = small_bags.map_with_resources()
     folder = Path(vi_map.metadata.external_resource_folders[0])
     sorted((folder / "raw_images").iterdir())[0].unlink()
     with pytest.raises(MapError, match="raw_images"):
@@ -155,20 +147,20 @@ def test_a_missing_image_leaves_no_bag(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize("kind", small_bags.FORMATS)
 def test_cancelling_leaves_no_bag(tmp_path: Path, kind: BagFormat) -> None:
     class Impatient(SilentProgress):
         def step(self, done: float, total: float, what: str = "") -> None:
             if done > 0:
                 raise Cancelled("cancelled")
 
-    vi_map, _, _ = map_with_resources()
+    vi_map, _, _ = small_bags.map_with_resources()
     with obeying(CancelToken()), pytest.raises(Cancelled):
         export_bag(
             vi_map,
             tmp_path,
             0,
-            named(tmp_path, kind),
+            small_bags.named(tmp_path, kind),
             BagExportOptions(format=kind.value),
             progress=Impatient(),
         )
@@ -176,7 +168,7 @@ def test_cancelling_leaves_no_bag(tmp_path: Path, kind: BagFormat) -> None:
 
 
 def test_bag_info_lists_topics_and_finds_damage(tmp_path: Path) -> None:
-    vi_map, _, _ = map_with_resources()
+    vi_map, _, _ = small_bags.map_with_resources()
     export_bag(vi_map, tmp_path, 0, tmp_path / "walk.bag")
     info = bag_info(tmp_path / "walk.bag")
     assert (info.format, info.messages) == ("ros1", sum(t.messages for t in info.topics))
@@ -201,7 +193,9 @@ VERTEX_RATE = PoseToBagOptions(interpolate_to_frequency_hz=1e-3)
 
 def recorded(folder: Path, kind: BagFormat) -> Path:
     version = 2 if kind.is_ros_2 else 1
-    return write_bag(make_content(), named(folder, kind, "in"), version=version, storage=kind.value)
+    return write_bag(
+        make_content(), small_bags.named(folder, kind, "in"), version=version, storage=kind.value
+    )
 
 
 def raw(path: Path) -> list[tuple[str, int, bytes]]:
@@ -209,10 +203,10 @@ def raw(path: Path) -> list[tuple[str, int, bytes]]:
         return [(c.topic, time_ns, data) for c, time_ns, data in reader.messages()]
 
 
-@pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize("kind", small_bags.FORMATS)
 def test_messages_stay_and_poses_come(tmp_path: Path, kind: BagFormat) -> None:
     vi_map, source = make_map(), recorded(tmp_path, kind)
-    target = named(tmp_path, kind)
+    target = small_bags.named(tmp_path, kind)
     report = add_poses_to_bag(vi_map, source, target, VERTEX_RATE, missions=FIRST)
     before = raw(source)
     after = raw(target)
@@ -220,7 +214,7 @@ def test_messages_stay_and_poses_come(tmp_path: Path, kind: BagFormat) -> None:
     assert [time for _, time, _ in after] == sorted(time for _, time, _ in after)
     assert report.copied_messages == len(before)
     assert report.messages == len(after) == len(before) + 4 * VERTICES
-    topics = messages_of(target)
+    topics = small_bags.messages_of(target)
     stamps = vi_map.vertices.timestamp_ns[:VERTICES].tolist()
     for name, T, frames in (
         ("/T_M_I", vi_map.vertices.T_M_I[:VERTICES], ("mission", "imu")),
@@ -228,7 +222,7 @@ def test_messages_stay_and_poses_come(tmp_path: Path, kind: BagFormat) -> None:
         ("/T_G_M", np.tile(vi_map.T_G_M[0], (VERTICES, 1)), ("map", "mission")),
     ):
         assert [time for time, _ in topics[name]] == stamps
-        poses = [pose_of(message.transform) for _, message in topics[name]]
+        poses = [small_bags.pose_of(message.transform) for _, message in topics[name]]
         np.testing.assert_array_equal(poses, T)
         heads = {(m.header.frame_id, m.child_frame_id) for _, m in topics[name]}
         assert heads == {frames}
@@ -236,7 +230,8 @@ def test_messages_stay_and_poses_come(tmp_path: Path, kind: BagFormat) -> None:
     assert [len(transforms) for transforms in tree] == [2] * VERTICES
     assert [t.child_frame_id for t in tree[0]] == ["mission", "imu"]
     np.testing.assert_array_equal(
-        [pose_of(transforms[1].transform) for transforms in tree], vi_map.vertices.T_M_I[:VERTICES]
+        [small_bags.pose_of(transforms[1].transform) for transforms in tree],
+        vi_map.vertices.T_M_I[:VERTICES],
     )
 
 
@@ -244,7 +239,7 @@ def test_several_missions_are_numbered_by_time(tmp_path: Path) -> None:
     vi_map, source = make_map(), recorded(tmp_path, BagFormat.ROS1)
     options = PoseToBagOptions(base_frame="body", odom_frame="odom", world_frame="world")
     add_poses_to_bag(vi_map, source, tmp_path / "out.bag", options)
-    topics = messages_of(tmp_path / "out.bag")
+    topics = small_bags.messages_of(tmp_path / "out.bag")
     for number in (0, 1):
         message = topics[f"/T_M_I_{number}"][0][1]
         assert (message.header.frame_id, message.child_frame_id) == (
@@ -259,16 +254,16 @@ def test_poses_between_vertices(tmp_path: Path) -> None:
     vi_map, source = make_map(), recorded(tmp_path, BagFormat.MCAP)
     options = PoseToBagOptions(add_tf=False, interpolate_to_frequency_hz=8.0)
     add_poses_to_bag(vi_map, source, tmp_path / "out", options, missions=FIRST)
-    topics = messages_of(tmp_path / "out")
+    topics = small_bags.messages_of(tmp_path / "out")
     assert "/tf" not in topics
     times_ns = np.array([time for time, _ in topics["/T_M_I"]])
     assert len(times_ns) == 4 * (VERTICES - 1) + 1
     assert set(np.diff(times_ns)) == {PERIOD_NS // 4}
-    T_M_I = np.array([pose_of(message.transform) for _, message in topics["/T_M_I"]])
+    T_M_I = np.array([small_bags.pose_of(message.transform) for _, message in topics["/T_M_I"]])
     np.testing.assert_array_equal(T_M_I, poses_at(vi_map, 0, times_ns))
     t = (times_ns - times_ns[0]) * 1e-9
     np.testing.assert_allclose(T_M_I[:, 6], 0.1 * t**2, atol=1e-12)  # cubic, not linear
-    T_G_I = np.array([pose_of(message.transform) for _, message in topics["/T_G_I"]])
+    T_G_I = np.array([small_bags.pose_of(message.transform) for _, message in topics["/T_G_I"]])
     np.testing.assert_array_equal(T_G_I, se3.compose(vi_map.T_G_M[0], T_M_I))
 
 
@@ -284,17 +279,19 @@ def test_pose_times(gaps: list[int], period: int) -> None:
     assert pose_times(stamps, period).tolist() == sorted(expected)
 
 
-@pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize("kind", small_bags.FORMATS)
 def test_a_bag_with_poses_gets_further_ones_or_loses_them(tmp_path: Path, kind: BagFormat) -> None:
     vi_map, source = make_map(), recorded(tmp_path, kind)
-    once, twice, dropped = (named(tmp_path, kind, name) for name in ("once", "twice", "dropped"))
+    once, twice, dropped = (
+        small_bags.named(tmp_path, kind, name) for name in ("once", "twice", "dropped")
+    )
     add_poses_to_bag(vi_map, source, once, VERTEX_RATE, missions=FIRST)
     add_poses_to_bag(vi_map, once, twice, VERTEX_RATE, missions=FIRST)
-    assert len(messages_of(twice)["/tf"]) == 2 * VERTICES
-    assert len(messages_of(twice)["/T_G_I"]) == 2 * VERTICES
+    assert len(small_bags.messages_of(twice)["/tf"]) == 2 * VERTICES
+    assert len(small_bags.messages_of(twice)["/T_G_I"]) == 2 * VERTICES
     options = PoseToBagOptions(add_tf=False, add_transform_stamped=False, drop_tf=True)
     add_poses_to_bag(vi_map, once, dropped, options, missions=FIRST)
-    assert set(messages_of(once)) - set(messages_of(dropped)) == {"/tf"}
+    assert set(small_bags.messages_of(once)) - set(small_bags.messages_of(dropped)) == {"/tf"}
 
 
 @pytest.mark.parametrize("kind", [BagFormat.SQLITE3, BagFormat.MCAP])
@@ -302,7 +299,7 @@ def test_a_single_file_of_a_ros_2_bag(tmp_path: Path, kind: BagFormat) -> None:
     (file, _) = bag_files(recorded(tmp_path, kind), kind)
     report = add_poses_to_bag(make_map(), file, tmp_path / "out", VERTEX_RATE, missions=FIRST)
     assert report.format == kind.value
-    assert len(messages_of(tmp_path / "out")["/T_G_I"]) == VERTICES
+    assert len(small_bags.messages_of(tmp_path / "out")["/T_G_I"]) == VERTICES
 
 
 def test_wrong_bags_are_refused(tmp_path: Path) -> None:
@@ -341,14 +338,14 @@ def test_wrong_bags_are_refused(tmp_path: Path) -> None:
         add_poses_to_bag(vi_map, source, target)
     assert target.read_bytes() == b"kept"
     add_poses_to_bag(vi_map, source, target, overwrite=True)
-    assert "/T_G_I_1" in messages_of(target)
+    assert "/T_G_I_1" in small_bags.messages_of(target)
 
 
 pytest.importorskip("rosbags")
 
 
 def test_poses_landmarks_closures_and_images_read_back(tmp_path: Path) -> None:
-    vi_map, images, _ = map_with_resources()
+    vi_map, images, _ = small_bags.map_with_resources()
     landmarks = vi_map.landmarks
     quality = np.full(len(landmarks), LandmarkQuality.GOOD, dtype=np.int8)
     closure = LoopClosureEdges.filled(1, from_vertex=[0], to_vertex=[2])
@@ -357,7 +354,7 @@ def test_poses_landmarks_closures_and_images_read_back(tmp_path: Path) -> None:
     )
     report = export_mcap(vi_map, tmp_path, tmp_path / "scene")
     assert (tmp_path / "scene" / "scene.mcap").is_file()
-    read = messages_of(tmp_path / "scene")
+    read = small_bags.messages_of(tmp_path / "scene")
     assert {topic.topic: topic.messages for topic in report.topics} == {
         topic: len(messages) for topic, messages in read.items()
     }
@@ -381,7 +378,7 @@ def _position(pose: object) -> list[float]:
 
 
 def test_images_are_left_out_on_request(tmp_path: Path) -> None:
-    vi_map = map_with_resources()[0]
+    vi_map = small_bags.map_with_resources()[0]
     report = export_mcap(vi_map, tmp_path, tmp_path / "scene", images=False)
     assert not any("image" in topic.topic for topic in report.topics)
 

@@ -28,14 +28,7 @@ from maplab_py.interop.recordings.bag_writing import (
 )
 from maplab_py.storage.resources.store import ResourceStore
 from maplab_py.vimap import VIMap
-from tests.interop.bags.small_bags import (
-    FORMATS,
-    OFFSET_NS,
-    map_with_resources,
-    named,
-    with_camera,
-    with_time_offset,
-)
+from tests.interop.bags import small_bags
 from tests.interop.recordings.written import image_message
 from tests.interop.small_map import IMU_ID, VERTICES, make_map
 
@@ -47,12 +40,12 @@ LEFT = BagImportOptions(resource_topic="/left/image_raw")
 ROS1 = MessageMaker(is_ros_2=False)
 
 
-@pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize("kind", small_bags.FORMATS)
 def test_what_was_exported_comes_back(tmp_path: Path, kind: BagFormat) -> None:
-    before, _, _ = map_with_resources()
-    path = named(tmp_path, kind)
+    before, _, _ = small_bags.map_with_resources()
+    path = small_bags.named(tmp_path, kind)
     export_bag(before, tmp_path, 0, path, BagExportOptions(format=kind.value))
-    bare = with_time_offset(make_map())
+    bare = small_bags.with_time_offset(make_map())
     vi_map = bare
     for options in (
         BagImportOptions("left/image_raw", camera_calibration_topic="/cam0/camera_info"),
@@ -75,7 +68,7 @@ def test_what_was_exported_comes_back(tmp_path: Path, kind: BagFormat) -> None:
 
 
 def test_what_is_there_stays(tmp_path: Path) -> None:
-    vi_map, _, _ = map_with_resources()
+    vi_map, _, _ = small_bags.map_with_resources()
     export_bag(vi_map, tmp_path, 0, tmp_path / "walk.bag")
     for options in (LEFT, BagImportOptions("/points0", sensor_id=IMU_ID)):
         again, report = import_bag_resources(vi_map, 0, tmp_path / "walk.bag", options)
@@ -102,13 +95,13 @@ def write_images(
 
 def image_bag(path: Path, vi_map: VIMap, shift_ns: int = 0, **changes: Any) -> Path:
     """Write grey images of the first mission at the times of the camera's clock."""
-    stamps = (vi_map.vertices.timestamp_ns[:VERTICES] - OFFSET_NS + shift_ns).tolist()
+    stamps = (vi_map.vertices.timestamp_ns[:VERTICES] - small_bags.OFFSET_NS + shift_ns).tolist()
     pixels = changes.get("pixels", np.full((480, 640), 80, dtype=np.uint8))
     return write_images(path, stamps, [ROS1.image(t, "left", pixels) for t in stamps])
 
 
 def test_the_time_offset_is_added(tmp_path: Path) -> None:
-    vi_map = with_time_offset(make_map())
+    vi_map = small_bags.with_time_offset(make_map())
     path = image_bag(tmp_path / "late.bag", vi_map, shift_ns=40_000_000)
     with pytest.raises(UserError, match=r"no message is within --image_tolerance_ms=1 .*offset_ns"):
         import_bag_resources(vi_map, 0, path, LEFT)
@@ -117,7 +110,7 @@ def test_the_time_offset_is_added(tmp_path: Path) -> None:
     assert report.attached == VERTICES
     np.testing.assert_array_equal(attached.resources.owner, np.arange(VERTICES))
     clouds = tmp_path / "clouds.bag"
-    with_clouds, _, _ = map_with_resources()
+    with_clouds, _, _ = small_bags.map_with_resources()
     export_bag(with_clouds, tmp_path, 0, clouds)
     options = BagImportOptions("/points0", resource_time_offset_ns=1000, sensor_id=IMU_ID)
     attached, _ = import_bag_resources(vi_map, 0, clouds, options)
@@ -126,7 +119,7 @@ def test_the_time_offset_is_added(tmp_path: Path) -> None:
 
 
 def test_colours_and_sixteen_bits(tmp_path: Path) -> None:
-    vi_map = with_time_offset(make_map())
+    vi_map = small_bags.with_time_offset(make_map())
     colours = np.random.default_rng(1).integers(0, 256, (480, 640, 3)).astype(np.uint8)
     path = image_bag(tmp_path / "colour.bag", vi_map, pixels=colours)
     attached, report = import_bag_resources(vi_map, 0, path, LEFT)
@@ -150,11 +143,11 @@ def depth_message(stamp: int, depth_m: np.ndarray, form: str) -> tuple[str, byte
 
 @pytest.mark.parametrize("form", ["16UC1", "32FC1", "compressedDepth"])
 def test_depth_in_millimetres_and_metres(tmp_path: Path, form: str) -> None:
-    vi_map = with_time_offset(make_map())
+    vi_map = small_bags.with_time_offset(make_map())
     depth_m = np.linspace(0.0, 9.0, 480 * 640).reshape(480, 640)
     if form == "32FC1":
         depth_m[0, :5] = np.nan
-    stamp = int(vi_map.vertices.timestamp_ns[1]) - OFFSET_NS
+    stamp = int(vi_map.vertices.timestamp_ns[1]) - small_bags.OFFSET_NS
     kind, data = depth_message(stamp, depth_m, form)
     path = write_images(tmp_path / "depth.bag", [stamp], [data], kind)
     attached, report = import_bag_resources(vi_map, 0, path, LEFT)
@@ -166,8 +159,8 @@ def test_depth_in_millimetres_and_metres(tmp_path: Path, form: str) -> None:
 
 
 def test_wrong_units_of_depth_are_refused(tmp_path: Path) -> None:
-    vi_map = with_time_offset(make_map())
-    stamp = int(vi_map.vertices.timestamp_ns[1]) - OFFSET_NS
+    vi_map = small_bags.with_time_offset(make_map())
+    stamp = int(vi_map.vertices.timestamp_ns[1]) - small_bags.OFFSET_NS
     kind, data = depth_message(stamp, np.full((480, 640), 2500.0), "32FC1")
     path = write_images(tmp_path / "depth.bag", [stamp], [data], kind)
     with pytest.raises(MapError, match=r"depth\.bag.* 32FC1 is in metres; record millimetres"):
@@ -175,11 +168,11 @@ def test_wrong_units_of_depth_are_refused(tmp_path: Path) -> None:
 
 
 def other_size(vi_map: VIMap) -> VIMap:
-    return with_camera(vi_map, width_px=600)
+    return small_bags.with_camera(vi_map, width_px=600)
 
 
 def other_focal_length(vi_map: VIMap) -> VIMap:
-    return with_camera(vi_map, intrinsics=np.array([260.0, 251.0, 320.0, 240.0]))
+    return small_bags.with_camera(vi_map, intrinsics=np.array([260.0, 251.0, 320.0, 240.0]))
 
 
 @pytest.mark.parametrize(
@@ -192,15 +185,15 @@ def other_focal_length(vi_map: VIMap) -> VIMap:
 def test_a_calibration_of_another_camera_is_refused(
     tmp_path: Path, change: Callable[[VIMap], VIMap], problem: str
 ) -> None:
-    export_bag(map_with_resources()[0], tmp_path, 0, tmp_path / "walk.bag")
-    vi_map = change(with_time_offset(make_map()))
+    export_bag(small_bags.map_with_resources()[0], tmp_path, 0, tmp_path / "walk.bag")
+    vi_map = change(small_bags.with_time_offset(make_map()))
     options = BagImportOptions("/left/image_raw", camera_calibration_topic="/cam0/camera_info")
     with pytest.raises(UserError, match=f"walk.bag: /cam0/camera_info: .*{problem}.*--camera"):
         import_bag_resources(vi_map, 0, tmp_path / "walk.bag", options)
 
 
 def test_wrong_topics_and_bags_are_refused(tmp_path: Path) -> None:
-    vi_map, _, _ = map_with_resources()
+    vi_map, _, _ = small_bags.map_with_resources()
     path = tmp_path / "walk.bag"
     export_bag(vi_map, tmp_path, 0, path)
 
@@ -227,7 +220,7 @@ def test_wrong_topics_and_bags_are_refused(tmp_path: Path) -> None:
 
 
 def test_an_empty_cloud_does_not_stop_the_others(tmp_path: Path) -> None:
-    vi_map = with_time_offset(make_map())
+    vi_map = small_bags.with_time_offset(make_map())
     stamps = vi_map.vertices.timestamp_ns[:4].tolist()
     places = [np.eye(3), np.zeros((0, 3)), np.full((2, 3), np.nan), 2.0 * np.eye(3)]
     data = [ROS1.cloud(t, "lidar", PlyCloud(p)) for t, p in zip(stamps, places, strict=True)]
@@ -243,8 +236,8 @@ def test_an_empty_cloud_does_not_stop_the_others(tmp_path: Path) -> None:
 
 
 def test_damaged_messages_are_refused(tmp_path: Path) -> None:
-    vi_map = with_time_offset(make_map())
-    stamps = (vi_map.vertices.timestamp_ns[:2] - OFFSET_NS).tolist()
+    vi_map = small_bags.with_time_offset(make_map())
+    stamps = (vi_map.vertices.timestamp_ns[:2] - small_bags.OFFSET_NS).tolist()
     pixels = np.zeros((480, 640), dtype=np.uint8)
     images = [ROS1.image(t, "left", pixels) for t in stamps]
 
@@ -267,7 +260,7 @@ def test_damaged_messages_are_refused(tmp_path: Path) -> None:
     message.data = data.reshape(-1)[:300]
     cut = [bytes(store.serialize_ros1(message, COMPRESSED))]
     refused("truncated", "png.bag", COMPRESSED, stamps[:1], cut)
-    inside = stamps[0] + OFFSET_NS + 10
+    inside = stamps[0] + small_bags.OFFSET_NS + 10
     far = ROS1.cloud(inside, "lidar", PlyCloud(2500.0 * np.eye(3)))
     refused("coordinates are in metres", "far.bag", CLOUD, stamps[:1], [far])
     cloud = ROS1.cloud(inside, "lidar", PlyCloud(np.eye(3)))
@@ -283,7 +276,7 @@ POSES = BagImportOptions("/points0", sensor_id=IMU_ID)
 
 @pytest.fixture
 def vi_map() -> VIMap:
-    return with_time_offset(make_map())
+    return small_bags.with_time_offset(make_map())
 
 
 def tried(path: Path, vi_map: VIMap, target: Path) -> list[str]:
@@ -302,13 +295,13 @@ def tried(path: Path, vi_map: VIMap, target: Path) -> list[str]:
     return problems
 
 
-@pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize("kind", small_bags.FORMATS)
 def test_cut_bags(tmp_path: Path, kind: BagFormat, vi_map: VIMap) -> None:
-    path = named(tmp_path, kind)
+    path = small_bags.named(tmp_path, kind)
     export_bag(vi_map, tmp_path, 0, path, BagExportOptions(kind.value, CONTENT))
     whole = bag_files(path, kind)[0].read_bytes()
     for number, length in enumerate(np.linspace(0, len(whole) - 1, 12).astype(int).tolist()):
-        damaged = named(tmp_path, kind, f"cut{number}")
+        damaged = small_bags.named(tmp_path, kind, f"cut{number}")
         if kind.is_ros_2:
             shutil.copytree(path, damaged)
             (damaged / path.name).with_suffix(bag_files(path, kind)[0].suffix).write_bytes(
@@ -316,22 +309,22 @@ def test_cut_bags(tmp_path: Path, kind: BagFormat, vi_map: VIMap) -> None:
             )
         else:
             damaged.write_bytes(whole[:length])
-        problems = tried(damaged, vi_map, named(tmp_path, kind, f"out{number}"))
+        problems = tried(damaged, vi_map, small_bags.named(tmp_path, kind, f"out{number}"))
         assert len(problems) == 3, length
-        assert not named(tmp_path, kind, f"out{number}").exists()
+        assert not small_bags.named(tmp_path, kind, f"out{number}").exists()
 
 
-@pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize("kind", small_bags.FORMATS)
 def test_changed_bags(tmp_path: Path, kind: BagFormat, vi_map: VIMap) -> None:
     rng = np.random.default_rng(7)
-    path = named(tmp_path, kind)
+    path = small_bags.named(tmp_path, kind)
     export_bag(vi_map, tmp_path, 0, path, BagExportOptions(kind.value, CONTENT))
     whole = bag_files(path, kind)[0].read_bytes()
     for number in range(15):
         data = np.frombuffer(whole, dtype=np.uint8).copy()
         data[rng.integers(0, len(data), 40)] = rng.integers(0, 256, 40)
         bag_files(path, kind)[0].write_bytes(data.tobytes())
-        tried(path, vi_map, named(tmp_path, kind, f"out{number}"))
+        tried(path, vi_map, small_bags.named(tmp_path, kind, f"out{number}"))
 
 
 def test_a_folder_without_its_file(tmp_path: Path, vi_map: VIMap) -> None:
@@ -363,12 +356,12 @@ def odd_bag(path: Path, kind: BagFormat) -> Path:
     return path
 
 
-@pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize("kind", small_bags.FORMATS)
 def test_unknown_types_are_listed_and_copied(tmp_path: Path, kind: BagFormat) -> None:
-    source = odd_bag(named(tmp_path, kind, "odd"), kind)
+    source = odd_bag(small_bags.named(tmp_path, kind, "odd"), kind)
     (topic,) = bag_info(source).topics
     assert (topic.topic, topic.type, topic.messages) == ("/odd", ODD, 2)
-    target = named(tmp_path, kind, "out")
+    target = small_bags.named(tmp_path, kind, "out")
     add_poses_to_bag(make_map(), source, target, missions=np.array([0]))
     with opened_bag(target) as reader:
         (connection,) = [c for c in reader.connections if c.topic == "/odd"]

@@ -22,39 +22,26 @@ from maplab_py.interop.recordings.bag_files import message_types
 from maplab_py.interop.recordings.options import SourceOptions
 from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.recordings.stream import EventStream
-from tests.interop.live.support import (
-    IMU,
-    FakeTransport,
-    gravity,
-    imu_message,
-    live,
-    small_device,
-    small_master,
-)
-from tests.interop.recordings.written import (
-    Content,
-    assert_content,
-    make_content,
-    write_folder,
-)
+from tests.interop.live import support
+from tests.interop.recordings import written
 
 PORT = 20_000 + os.getpid() % 20_000
 
 
 @pytest.fixture(scope="module")
-def content() -> Content:
-    return gravity(make_content())
+def content() -> written.Content:
+    return support.gravity(written.make_content())
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory, content: Content) -> Path:
-    return write_folder(content, tmp_path_factory.mktemp("played") / "room")
+def folder(tmp_path_factory: pytest.TempPathFactory, content: written.Content) -> Path:
+    return written.write_folder(content, tmp_path_factory.mktemp("played") / "room")
 
 
 @pytest.fixture(scope="module")
 def calibration(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("calibration")
-    small_device(place)
+    support.small_device(place)
     return place / "sensors.yaml"
 
 
@@ -69,12 +56,12 @@ def play(folder: Path, kind: str, network: NetworkOptions, **options: float) -> 
 
 @pytest.mark.parametrize(("kind", "name"), [("ros1", "again.bag"), ("foxglove", "again")])
 def test_a_played_recording_is_recorded_stamp_by_stamp(
-    folder: Path, content: Content, calibration: Path, tmp_path: Path, kind: str, name: str
+    folder: Path, content: written.Content, calibration: Path, tmp_path: Path, kind: str, name: str
 ) -> None:
     """ROS 2 takes two programs, see the last test."""
     if kind == "foxglove":
         pytest.importorskip("websockets")
-    with small_master() as master:
+    with support.small_master() as master:
         url = f"ws://127.0.0.1:{PORT + 1}"
         network = NetworkOptions(ros_master_uri=master.uri, foxglove_url=url)
         player = play(folder, kind, network)
@@ -83,18 +70,18 @@ def test_a_played_recording_is_recorded_stamp_by_stamp(
         player.join()
     assert [t.messages for t in report.topics] == [len(content.imu_ns), 8, 8]
     again = open_recording(tmp_path / name, SourceOptions(sensor_calibration_file=calibration))
-    assert_content(list(EventStream(again)), content)
+    written.assert_content(list(EventStream(again)), content)
 
 
 def test_a_bag_of_ros_2_is_a_folder(tmp_path: Path) -> None:
-    with small_master() as master:
+    with support.small_master() as master:
         network = NetworkOptions(ros_master_uri=master.uri)
         with pytest.raises(UserError, match=r"go to a file \.bag: name it so"):
             record_bag("ros1", tmp_path / "bag", network, RecordingOptions(), silence_s=1.0)
 
 
 def test_a_client_of_foxglove_reads_what_the_server_plays(
-    folder: Path, content: Content, calibration: Path, tmp_path: Path
+    folder: Path, content: written.Content, calibration: Path, tmp_path: Path
 ) -> None:
     pytest.importorskip("websockets")
     network = NetworkOptions(foxglove_url=f"ws://127.0.0.1:{PORT}")
@@ -105,7 +92,7 @@ def test_a_client_of_foxglove_reads_what_the_server_plays(
         assert sorted(client.topics()) == names
         device = open_recording(folder).device
         source = SourceOptions(imu_topic="/imu0", camera_topics="/cam0/image_raw,/cam1/image_raw")
-        recording = live(client, device, source, LiveOptions(silence_s=1.5), wait_s=5.0)
+        recording = support.live(client, device, source, LiveOptions(silence_s=1.5), wait_s=5.0)
         items = list(recording.items())
     player.join()
     images = [item for item in items if hasattr(item, "camera")]
@@ -126,17 +113,17 @@ def test_no_server_of_foxglove_is_said_with_the_remedy() -> None:
 
 
 def test_topics_are_listed_with_their_rates() -> None:
-    with small_master() as master:
+    with support.small_master() as master:
         network = NetworkOptions(ros_master_uri=master.uri)
         with open_transport("ros1", network) as robot:
-            publish = robot.advertise("/imu0", IMU)
+            publish = robot.advertise("/imu0", support.IMU)
             is_over = threading.Event()
 
             def send() -> None:
                 stamp_ns = 0
                 while not is_over.wait(0.02):
                     stamp_ns += 1
-                    publish(imu_message(stamp_ns, is_ros_2=False))
+                    publish(support.imu_message(stamp_ns, is_ros_2=False))
 
             thread = threading.Thread(target=send)
             thread.start()
@@ -144,14 +131,14 @@ def test_topics_are_listed_with_their_rates() -> None:
             is_over.set()
             thread.join()
     (topic,) = report.topics
-    assert (topic.topic, topic.type, topic.publishers) == ("/imu0", IMU, 1)
+    assert (topic.topic, topic.type, topic.publishers) == ("/imu0", support.IMU, 1)
     assert topic.rate_hz is not None
     assert 5.0 < topic.rate_hz < 55.0
     assert report.failure == ""
 
 
 def test_nothing_to_list_is_a_failure_with_advice() -> None:
-    with small_master() as master:
+    with support.small_master() as master:
         report = list_topics("ros1", NetworkOptions(ros_master_uri=master.uri), 0.2)
     assert "nobody publishes anything" in report.failure
     assert "ROS_DOMAIN_ID" in report.advice
@@ -165,7 +152,7 @@ def test_wrong_transports_are_refused(folder: Path) -> None:
 
 
 def test_ros_2_is_played_and_recorded_by_two_programs(
-    folder: Path, content: Content, calibration: Path, tmp_path: Path
+    folder: Path, content: written.Content, calibration: Path, tmp_path: Path
 ) -> None:
     pytest.importorskip("cyclonedds")
     domain = f"--ros_domain_id={10 + os.getpid() % 80}"
@@ -183,7 +170,7 @@ def test_ros_2_is_played_and_recorded_by_two_programs(
     assert player.wait(60) == 0
     assert done.returncode == 0, done.stderr
     again = open_recording(bag, SourceOptions(sensor_calibration_file=calibration))
-    assert_content(list(EventStream(again)), content)
+    written.assert_content(list(EventStream(again)), content)
 
 
 def random_estimate(seed: int, *, is_localised: bool = True) -> Estimate:
@@ -203,7 +190,7 @@ def random_estimate(seed: int, *, is_localised: bool = True) -> Estimate:
 
 @pytest.mark.parametrize("is_ros_2", [True, False])
 def test_the_estimate_is_in_the_messages(is_ros_2: bool) -> None:
-    transport, estimate = FakeTransport(is_ros_2=is_ros_2), random_estimate(1)
+    transport, estimate = support.FakeTransport(is_ros_2=is_ros_2), random_estimate(1)
     publisher = PosePublisher(transport, LiveOptions(publish_landmarks=True))
     publisher.publish(estimate)
     publisher.publish_landmarks(5, np.ones((4, 3)))
@@ -232,7 +219,7 @@ def test_the_estimate_is_in_the_messages(is_ros_2: bool) -> None:
 
 
 def test_without_a_map_there_is_no_pose_in_it() -> None:
-    transport = FakeTransport()
+    transport = support.FakeTransport()
     PosePublisher(transport, LiveOptions()).publish(random_estimate(2, is_localised=False))
     assert transport.published["/maplab/pose_in_map"] == []
     message = message_types(is_ros_2=True).deserialize_cdr(

@@ -8,15 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from maplab_py.errors import UserError
+from maplab_py.interop.live import ros1
 from maplab_py.interop.live.connection import open_transport
 from maplab_py.interop.live.options import NetworkOptions
-from maplab_py.interop.live.ros1 import (
-    ConnectionProblem,
-    header_bytes,
-    parse_header,
-    receive_header,
-    receive_message,
-)
 from maplab_py.interop.live.transport import Topic, wait_for_topics
 from tests.interop.live.support import IMU, imu_message, small_master
 from tests.support.waiting import wait_until
@@ -28,27 +22,29 @@ WORDS = st.text(st.characters(codec="ascii", exclude_characters="="), min_size=1
 
 @given(st.dictionaries(WORDS, WORDS, max_size=5))
 def test_headers_are_read_as_they_were_written(fields: dict[str, str]) -> None:
-    data = header_bytes(fields)
+    data = ros1.header_bytes(fields)
     assert struct.unpack_from("<I", data)[0] == len(data) - 4
-    assert parse_header(data[4:]) == fields
+    assert ros1.parse_header(data[4:]) == fields
 
 
 @given(st.binary(max_size=200))
 def test_damaged_headers_are_refused(data: bytes) -> None:
-    with pytest.raises(ConnectionProblem, match="damaged"):
-        parse_header(b"\x05\x00\x00\x00" + data.replace(b"=", b"")[:4])
-    with pytest.raises(ConnectionProblem, match="damaged"):
-        parse_header(header_bytes({"key": "value"})[4:] + b"\xff" + data)
+    with pytest.raises(ros1.ConnectionProblem, match="damaged"):
+        ros1.parse_header(b"\x05\x00\x00\x00" + data.replace(b"=", b"")[:4])
+    with pytest.raises(ros1.ConnectionProblem, match="damaged"):
+        ros1.parse_header(ros1.header_bytes({"key": "value"})[4:] + b"\xff" + data)
 
 
 @pytest.mark.parametrize(
-    ("receive", "what"), [(receive_header, "header"), (receive_message, "message")]
+    ("receive", "what"), [(ros1.receive_header, "header"), (ros1.receive_message, "message")]
 )
 def test_sizes_are_checked_before_memory_is_taken(receive: object, what: str) -> None:
     here, there = socket.socketpair()
     with here, there:
         there.sendall(struct.pack("<I", 2**32 - 1))
-        with pytest.raises(ConnectionProblem, match=f"{what} of 4,294,967,295 bytes is refused"):
+        with pytest.raises(
+            ros1.ConnectionProblem, match=f"{what} of 4,294,967,295 bytes is refused"
+        ):
             receive(here)  # type: ignore[operator]
 
 

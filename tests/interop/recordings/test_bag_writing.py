@@ -15,14 +15,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from maplab_py.errors import MapError, UserError
+from maplab_py.interop.recordings import bag_layouts
 from maplab_py.interop.recordings.bag_files import message_types, opened_bag
-from maplab_py.interop.recordings.bag_layouts import (
-    imu_messages,
-    odometry_messages,
-    pose_messages,
-    tf_messages,
-    transform_messages,
-)
 from maplab_py.interop.recordings.bag_writing import (
     BagFormat,
     BagMessage,
@@ -69,7 +63,7 @@ def test_imu_messages_are_those_of_rosbags(
 ) -> None:
     store = message_types(is_ros_2=is_ros_2)
     times_ns, values = data
-    rows = imu_messages(times_ns, values, frame, is_ros_2=is_ros_2)
+    rows = bag_layouts.imu_messages(times_ns, values, frame, is_ros_2=is_ros_2)
     for row, time_ns, sample in zip(rows, times_ns.tolist(), values, strict=True):
         message = imu_message(store, time_ns, sample, 2 if is_ros_2 else 1)
         message.header.frame_id = frame
@@ -84,10 +78,10 @@ def test_poses_are_those_of_rosbags(
 ) -> None:
     store, (times_ns, T_A_B) = message_types(is_ros_2=is_ros_2), data
     types = store.types
-    poses = pose_messages(times_ns, T_A_B, frames[0], is_ros_2=is_ros_2)
-    transforms = transform_messages(times_ns, T_A_B, frames, is_ros_2=is_ros_2)
+    poses = bag_layouts.pose_messages(times_ns, T_A_B, frames[0], is_ros_2=is_ros_2)
+    transforms = bag_layouts.transform_messages(times_ns, T_A_B, frames, is_ros_2=is_ros_2)
     both = [(T_A_B, frames), (T_A_B[::-1], (frames[1], frames[0]))]
-    trees = tf_messages(times_ns, both, is_ros_2=is_ros_2)
+    trees = bag_layouts.tf_messages(times_ns, both, is_ros_2=is_ros_2)
 
     def stamped(row: int, T: np.ndarray, parent: str, child: str) -> Any:
         turn = types["geometry_msgs/msg/Quaternion"](*T[:4].tolist())
@@ -116,7 +110,7 @@ def test_odometry_has_the_velocity_of_the_body(is_ros_2: bool) -> None:
     half = np.sqrt(0.5)
     T_M_I = np.array([[0.0, 0.0, half, half, 1.0, 2.0, 3.0]])  # turned left by 90 degrees
     v_M = np.array([[0.0, 2.0, 0.5]])
-    (row,) = odometry_messages(
+    (row,) = bag_layouts.odometry_messages(
         np.array([3_000_000_001]), T_M_I, v_M, ("mission", "imu"), is_ros_2=is_ros_2
     )
     read = store.deserialize_cdr if is_ros_2 else store.deserialize_ros1
@@ -133,7 +127,7 @@ def test_20_000_imu_messages_read_back_to_the_last_bit(tmp_path: Path, kind: Bag
     rng = np.random.default_rng(3)
     times_ns = 1_403_715_273_262_142_976 + np.cumsum(rng.integers(1, 10_000_000, 20_000))
     values = rng.normal(size=(20_000, 6)) * 10.0 ** rng.integers(-300, 300, (20_000, 6))
-    rows = imu_messages(times_ns, values, "imu", is_ros_2=kind.is_ros_2)
+    rows = bag_layouts.imu_messages(times_ns, values, "imu", is_ros_2=kind.is_ros_2)
     path = named(tmp_path, kind)
     counts = write_bag(path, kind, messages_of_topic(times_ns, "/imu0", IMU, rows))
     assert counts == {"/imu0": 20_000}
@@ -149,7 +143,7 @@ def test_20_000_imu_messages_read_back_to_the_last_bit(tmp_path: Path, kind: Bag
 
 def few(kind: BagFormat, topic: str = "/imu0", start: int = 10) -> Iterator[BagMessage]:
     times_ns = np.arange(start, start + 40, 10)
-    rows = imu_messages(times_ns, np.ones((4, 6)), "imu", is_ros_2=kind.is_ros_2)
+    rows = bag_layouts.imu_messages(times_ns, np.ones((4, 6)), "imu", is_ros_2=kind.is_ros_2)
     return messages_of_topic(times_ns, topic, IMU, rows)
 
 
@@ -230,7 +224,7 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
         write_bag(tmp_path / "walk", BagFormat.SQLITE3, unknown)
     for time_ns in (-1, 2**31 * 1_000_000_000):
         with pytest.raises(UserError, match="cannot be written into a bag"):
-            imu_messages(np.array([time_ns]), np.ones((1, 6)), "imu", is_ros_2=True)
+            bag_layouts.imu_messages(np.array([time_ns]), np.ones((1, 6)), "imu", is_ros_2=True)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -15,37 +15,32 @@ from maplab_py.interop.recordings.options import SourceOptions, StreamOptions
 from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.interop.recordings.summary import summarise
-from tests.interop.recordings.written import (
-    assert_content,
-    image_message,
-    imu_message,
-    make_content,
-    write_bag,
-    write_calibration,
-    write_folder,
-    write_messages,
-)
+from tests.interop.recordings import written
 
 typesys = pytest.importorskip("rosbags.typesys")
 Stores, get_typestore = typesys.Stores, typesys.get_typestore
 
-CONTENT = make_content(frames=4)
+CONTENT = written.make_content(frames=4)
 MCAP, DATA_END = b"\x89MCAP0\r\n", 0x0F
 
 
 @pytest.fixture(scope="module")
 def calibrated(tmp_path_factory: pytest.TempPathFactory) -> SourceOptions:
     folder = tmp_path_factory.mktemp("device")
-    device = open_recording(write_folder(make_content(frames=1), folder / "room")).device
-    return SourceOptions(sensor_calibration_file=write_calibration(device, folder / "sensors.yaml"))
+    device = open_recording(
+        written.write_folder(written.make_content(frames=1), folder / "room")
+    ).device
+    return SourceOptions(
+        sensor_calibration_file=written.write_calibration(device, folder / "sensors.yaml")
+    )
 
 
 def bag(tmp_path: Path, storage: str = "sqlite3") -> Path:
-    return write_bag(CONTENT, tmp_path / "room", version=2, storage=storage)
+    return written.write_bag(CONTENT, tmp_path / "room", version=2, storage=storage)
 
 
 def assert_reads(path: Path, calibrated: SourceOptions) -> None:
-    assert_content(list(EventStream(open_recording(path, calibrated))), CONTENT)
+    written.assert_content(list(EventStream(open_recording(path, calibrated))), CONTENT)
 
 
 def database(path: Path) -> sqlite3.Connection:
@@ -176,7 +171,9 @@ def test_compressed_files(
 def test_files_with_other_endings(
     tmp_path: Path, calibrated: SourceOptions, version: int, name: str
 ) -> None:
-    path = write_bag(CONTENT, tmp_path / ("a.bag" if version == 1 else "a"), version=version)
+    path = written.write_bag(
+        CONTENT, tmp_path / ("a.bag" if version == 1 else "a"), version=version
+    )
     file = path if version == 1 else path / "a.db3"
     assert_reads(file.rename(tmp_path / name), calibrated)
     assert bag_info(tmp_path / name).format == ("ros1" if version == 1 else "sqlite3")
@@ -233,16 +230,16 @@ def test_videos_are_noted_and_converted_encodings_named(
     store = get_typestore(Stores.ROS1_NOETIC)
     video = store.types["sensor_msgs/msg/CompressedImage"]
     messages = [
-        (t, "/imu0", imu_message(store, t, values, 1))
+        (t, "/imu0", written.imu_message(store, t, values, 1))
         for t, values in zip(CONTENT.imu_ns.tolist(), CONTENT.accel_gyro, strict=True)
     ]
     for t, image in zip(CONTENT.stamps_ns[0].tolist(), CONTENT.images[0], strict=True):
-        header = image_message(store, t, image, "mono8", 1).header
+        header = written.image_message(store, t, image, "mono8", 1).header
         packet = np.frombuffer(b"\0\0\0\1gB" * 9, dtype=np.uint8)
         messages.append((t, "/cam0/image_raw", video(header, "h264", packet)))
-        mosaic = image_message(store, t, image, "bayer_rggb8", 1)
+        mosaic = written.image_message(store, t, image, "bayer_rggb8", 1)
         messages.append((t, "/cam1/image_raw", mosaic))
-    write_messages(tmp_path / "v.bag", store, sorted(messages, key=lambda entry: entry[:2]))
+    written.write_messages(tmp_path / "v.bag", store, sorted(messages, key=lambda entry: entry[:2]))
     assert [topic.encoding for topic in bag_info(tmp_path / "v.bag").images] == [
         "h264",
         "bayer_rggb8",
@@ -259,18 +256,18 @@ def image_bag(tmp_path: Path, **changes: object) -> Path:
     store = get_typestore(Stores.ROS1_NOETIC)
     stamps = CONTENT.imu_ns.tolist()
     messages = [
-        (t, "/imu0", imu_message(store, t, values, 1))
+        (t, "/imu0", written.imu_message(store, t, values, 1))
         for t, values in zip(stamps, CONTENT.accel_gyro, strict=True)
     ]
     for camera in (0, 1):
         for t, image in zip(
             CONTENT.stamps_ns[camera].tolist(), CONTENT.images[camera], strict=True
         ):
-            message = image_message(store, t, image, "mono8", 1, padding=0)
+            message = written.image_message(store, t, image, "mono8", 1, padding=0)
             changed = dataclasses.replace(message, **changes)
             messages.append((t, f"/cam{camera}/image_raw", changed))
     messages.sort(key=lambda entry: entry[:2])
-    write_messages(tmp_path / "a.bag", store, messages)
+    written.write_messages(tmp_path / "a.bag", store, messages)
     return tmp_path / "a.bag"
 
 
@@ -278,7 +275,7 @@ def test_folders_of_bags_and_open_bags_are_told(tmp_path: Path, calibrated: Sour
     path = bag(tmp_path)
     with pytest.raises(UserError, match=f"it holds {path}$"):
         open_recording(tmp_path, calibrated)
-    recorded = write_bag(CONTENT, tmp_path / "b.bag").rename(tmp_path / "b.bag.active")
+    recorded = written.write_bag(CONTENT, tmp_path / "b.bag").rename(tmp_path / "b.bag.active")
     with pytest.raises(UserError, match=r"run `rosbag reindex \S*b.bag.active`"):
         open_recording(recorded, calibrated)
 
@@ -298,7 +295,7 @@ def test_each_failure_names_its_remedy(tmp_path: Path, calibrated: SourceOptions
     with pytest.raises(MapError, match=r"room.db3 of its metadata.yaml is missing"):
         open_recording(path, calibrated)
     shutil.rmtree(path)
-    unclosed = write_bag(CONTENT, tmp_path / "room.bag")
+    unclosed = written.write_bag(CONTENT, tmp_path / "room.bag")
     data = bytearray(unclosed.read_bytes())
     place = data.index(b"index_pos=") + len(b"index_pos=")
     data[place : place + 8] = bytes(8)

@@ -9,13 +9,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64
 from maplab_py.interop.imu_csv import ImuRecording, write_imu_csv
-from maplab_py.interop.recordings.protocol import (
-    CameraImage,
-    Event,
-    FrameSet,
-    ImuBatch,
-    RecordedSensors,
-)
+from maplab_py.interop.recordings import protocol
 from maplab_py.sensors.sensors_yaml import write_sensors
 
 START_NS = 1403715273262142976
@@ -98,7 +92,7 @@ def write_folder(content: Content, folder: Path, *, suffix: str = ".png") -> Pat
     return folder
 
 
-def write_calibration(device: RecordedSensors, path: Path) -> Path:
+def write_calibration(device: protocol.RecordedSensors, path: Path) -> Path:
     """Write sensors.yaml with the topics /imu0 and /cam0/image_raw, /cam1/image_raw, ..."""
     imu = dataclasses.replace(device.imu, topic="/imu0")
     cameras = tuple(
@@ -209,21 +203,21 @@ def image_message(
     return kind(head, height, width, encoding, 0, rows.shape[1], rows.reshape(-1))
 
 
-def samples(events: list[Event]) -> tuple[I64, F64]:
+def samples(events: list[protocol.Event]) -> tuple[I64, F64]:
     """All IMU samples of a stream."""
-    batches = [event for event in events if isinstance(event, ImuBatch)]
+    batches = [event for event in events if isinstance(event, protocol.ImuBatch)]
     return (
         np.concatenate([batch.times_ns for batch in batches]),
         np.concatenate([batch.accel_gyro for batch in batches]),
     )
 
 
-def frame_sets(events: list[Event]) -> list[FrameSet]:
+def frame_sets(events: list[protocol.Event]) -> list[protocol.FrameSet]:
     """All frame sets of a stream."""
-    return [event for event in events if isinstance(event, FrameSet)]
+    return [event for event in events if isinstance(event, protocol.FrameSet)]
 
 
-def assert_content(events: list[Event], content: Content) -> None:
+def assert_content(events: list[protocol.Event], content: Content) -> None:
     """Compare a stream with what was recorded: every sample, stamp and pixel, and the order."""
     times_ns, accel_gyro = samples(events)
     np.testing.assert_array_equal(times_ns, content.imu_ns)
@@ -236,18 +230,18 @@ def assert_content(events: list[Event], content: Content) -> None:
     assert_in_order(events)
 
 
-def assert_image(image: CameraImage, camera: int, content: Content, row: int) -> None:
+def assert_image(image: protocol.CameraImage, camera: int, content: Content, row: int) -> None:
     assert (image.camera, image.stamp_ns) == (camera, content.stamps_ns[camera][row])
     pixels = image.decode()
     assert pixels.dtype == content.images[camera][row].dtype
     np.testing.assert_array_equal(pixels, content.images[camera][row])
 
 
-def assert_in_order(events: list[Event]) -> None:
+def assert_in_order(events: list[protocol.Event]) -> None:
     """IMU samples increase, and those up to the time of a frame set come before it, no others."""
     last_sample = last_set = -1
     for event in events:
-        if isinstance(event, ImuBatch):
+        if isinstance(event, protocol.ImuBatch):
             assert event.time_ns > max(last_sample, last_set)
             assert np.all(np.diff(event.times_ns) > 0)
             last_sample = int(event.times_ns[-1])
