@@ -35,8 +35,7 @@ from maplab_py.interop.resources.depth_maps import import_depth_maps
 from maplab_py.interop.resources.images import ImageImportOptions, import_images
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.storage.native import load_map
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.queries import resources_of
+from maplab_py.vimap import VIMap, resources_of
 from tests.support.stereo_room import StereoRoom
 
 VOXEL_M, FAR_M = 0.05, 6.0

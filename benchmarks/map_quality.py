@@ -21,8 +21,7 @@ from maplab_py.simulation.evaluation import evaluate_map, shown_points, sighting
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate
 from maplab_py.simulation.truth import Truth
-from maplab_py.vimap import LandmarkQuality, VIMap
-from maplab_py.vimap.ids import IdIndex
+from maplab_py.vimap import IdIndex, LandmarkQuality, VIMap
 from tests.algorithms.loop_closure.against_truth import joined
 
 NEAR_M = 0.05

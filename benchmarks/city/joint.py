@@ -26,8 +26,7 @@ from maplab_py.pipeline.plan import MAP_TEMPLATE, RESULT_TEMPLATE, Stage
 from maplab_py.report import Report
 from maplab_py.sensors.yaml_text import parse_yaml
 from maplab_py.simulation.truth import Truth
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.ids import IdIndex
+from maplab_py.vimap import IdIndex, VIMap
 
 FLAGS_FILE = Path(__file__).parents[2] / "flags" / "city.yaml"
 _EVALUATED = ("anchor_all_missions", "relax", "lc", "optvi")

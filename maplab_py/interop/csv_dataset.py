@@ -19,8 +19,7 @@ from maplab_py.options import Options, option
 from maplab_py.output_files import check_writable, write_text
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
-from maplab_py.vimap import VIMap, ids, ragged_rows
-from maplab_py.vimap.tables import LandmarkQuality
+from maplab_py.vimap import LandmarkQuality, VIMap, ids, ragged_rows
 
 _VERTICES = (
     "vertex index, timestamp [ns], position x [m], position y [m], position z [m], quaternion x, "

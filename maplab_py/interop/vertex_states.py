@@ -17,9 +17,8 @@ from maplab_py.geometry.interpolation import interpolate_poses, interpolate_vect
 from maplab_py.interop.text_table import format_rows
 from maplab_py.interop.trajectories import Trajectory, write_tum
 from maplab_py.output_files import write_text
-from maplab_py.vimap import VIMap, ids, ragged_rows
+from maplab_py.vimap import MissionSensor, VIMap, ids, ragged_rows
 from maplab_py.vimap.nav_state import NavState
-from maplab_py.vimap.tables import MissionSensor
 
 ASL_FILE, RPG_FILE = "vertex_poses_velocities_biases.csv", "stamped_traj_estimate.txt"
 _ASL_HEADER = (

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from maplab_py.errors import UserError
 from maplab_py.plotting import figure as figures
 from maplab_py.report import counted
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import LandmarkQuality, VIMap
 from maplab_py.vimap.queries import coobservation_counts, mission_mask, observation_counts
-from maplab_py.vimap.tables import LandmarkQuality
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

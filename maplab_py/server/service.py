@@ -22,8 +22,7 @@ from maplab_py.geometry.interpolation import interpolate_poses
 from maplab_py.report import Message, to_json
 from maplab_py.server.options import DeletedMissions, LookupReport
 from maplab_py.storage.resources.types import resource_type
-from maplab_py.vimap import MissionSensor, VIMap
-from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap import MissionSensor, VIMap, to_hex
 from maplab_py.vimap.queries import find_mission, mission_sensor_id, resources_of
 
 if TYPE_CHECKING:

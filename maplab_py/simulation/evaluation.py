@@ -14,9 +14,7 @@ from maplab_py.geometry.alignment import align_yaw_position, umeyama
 from maplab_py.report import Report
 from maplab_py.sensors import ImuIntrinsics
 from maplab_py.simulation.truth import Truth
-from maplab_py.vimap import MissionSensor, VIMap
-from maplab_py.vimap.ids import IdIndex, to_hex
-from maplab_py.vimap.queries import mission_sensor_id
+from maplab_py.vimap import IdIndex, MissionSensor, VIMap, mission_sensor_id, to_hex
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
 
 _FALSE_EDGE_M, _FALSE_EDGE_DEG = 0.5, 5.0

@@ -21,10 +21,9 @@ from maplab_py.simulation.scenario import OtherSensorOptions, Scenario
 from maplab_py.simulation.sensors import Device, baseframe
 from maplab_py.simulation.truth import Truth, session_truth
 from maplab_py.simulation.world import World
-from maplab_py.vimap import TransformationKind, VIMap, tables
+from maplab_py.vimap import TransformationKind, VIMap, starts_of_counts, tables
 from maplab_py.vimap.descriptors import binary_blocks
 from maplab_py.vimap.ids import from_hex, random_ids, to_hex
-from maplab_py.vimap.table import starts_of_counts
 
 _KEYPOINT_SCALE = 20.0
 _MIN_SIGMA_PX = 0.1

@@ -12,9 +12,8 @@ from maplab_py.errors import EstimationError, MapError, MaplabError, UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.geometry.interpolation import interpolate_poses
 from maplab_py.interop.trajectories import Trajectory, read_kitti, write_euroc, write_tum
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import TransformationKind, VIMap
 from maplab_py.vimap.consistency import check_consistency
-from maplab_py.vimap.tables import TransformationKind
 from tests.interop.small_map import RIG_ID, VERTICES, make_map
 
 TURN = se3.make(so3.exp([0.0, 0.0, 0.7]), np.array([10.0, -5.0, 2.0]))

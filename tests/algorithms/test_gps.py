@@ -21,9 +21,8 @@ from maplab_py.geometry import se3, so3
 from maplab_py.geometry.alignment import umeyama
 from maplab_py.interop.gps import read_gps
 from maplab_py.interop.trajectories import Trajectory
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import AbsolutePoses, VIMap
 from maplab_py.vimap.merge import merge_maps
-from maplab_py.vimap.tables import AbsolutePoses
 
 ORIGIN = (47.3769, 8.5417, 450.0)
 START_NS = 1_700_000_000_000_000_000

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from maplab_py.algorithms.scale_check import mission_scales, scale_doubts
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.tables import ImuEdges
+from maplab_py.vimap import ImuEdges, VIMap
 from tests.frontend.simulated import replayed
 
 

@@ -23,9 +23,8 @@ from maplab_py.simulation.evaluation import evaluate_map
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.session import wheel_velocities, write_wheel_velocities
 from maplab_py.simulation.simulate import simulate
-from maplab_py.vimap import Backbone, MissionSensor, TransformationKind, VIMap
+from maplab_py.vimap import Backbone, MissionSensor, TransformationKind, VIMap, to_hex
 from maplab_py.vimap.consistency import check_consistency
-from maplab_py.vimap.ids import to_hex
 from maplab_py.vimap.merge import merge_maps
 from maplab_py.vimap.vertex_removal import join_transformation_edges
 from tests.support.scene import Scene

@@ -20,8 +20,7 @@ from maplab_py.interop.colmap.options import ColmapExportOptions
 from maplab_py.interop.resources.images import import_images
 from maplab_py.storage.resources.store import ResourceStore
 from maplab_py.storage.summary_map import read_summary_map
-from maplab_py.vimap import MissionSensor, VIMap
-from maplab_py.vimap.queries import mission_sensor_id
+from maplab_py.vimap import MissionSensor, VIMap, mission_sensor_id
 from tests.algorithms.image_features.test_extraction import room
 from tests.docs.markdown import blocks
 from tests.support.data import REPOSITORY

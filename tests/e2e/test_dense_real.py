@@ -8,8 +8,7 @@ import pytest
 from maplab_py.algorithms.dense.resources import FrameResources
 from maplab_py.console.session.session import Session
 from maplab_py.geometry import se3
-from maplab_py.vimap import LandmarkQuality
-from maplab_py.vimap.queries import observer_counts, resources_of
+from maplab_py.vimap import LandmarkQuality, observer_counts, resources_of
 from tests.support.data import shared_data
 
 _MIN_OBSERVERS = 4

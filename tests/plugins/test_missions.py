@@ -6,8 +6,7 @@ from maplab_plugins.visualization.following import Following
 from maplab_py.console.session.session import Session
 from maplab_py.console.terminal.protocol import SilentTerminal
 from maplab_py.errors import Cancelled, UserError
-from maplab_py.vimap.ids import to_hex
-from maplab_py.vimap.queries import mission_labels
+from maplab_py.vimap import mission_labels, to_hex
 from tests.console.sample_plugin import map_of
 from tests.vimap.builders import walk_map
 

@@ -18,8 +18,7 @@ from maplab_py.storage.resources.types import RESOURCE_TYPES
 from maplab_py.viewer.display.viewer import Viewer
 from maplab_py.viewer.picking import Pick
 from maplab_py.viewer.scene import Entity
-from maplab_py.vimap import ResourceOwner, Resources, VIMap
-from maplab_py.vimap.ids import random_ids, to_hex
+from maplab_py.vimap import ResourceOwner, Resources, VIMap, random_ids, to_hex
 from tests.vimap.builders import T_I_C, walk_map
 
 TYPES = {kind.name: kind.number for kind in RESOURCE_TYPES}

@@ -12,8 +12,7 @@ from maplab_py.interop.resources.matching import camera_frames, mission_rig
 from maplab_py.storage.native import save_map
 from maplab_py.storage.resources.store import relative_path
 from maplab_py.storage.resources.types import RESOURCE_TYPES
-from maplab_py.vimap import ResourceOwner, Resources, VIMap
-from maplab_py.vimap.ids import random_ids
+from maplab_py.vimap import ResourceOwner, Resources, VIMap, random_ids
 
 _TYPES = {kind.name: kind.number for kind in RESOURCE_TYPES}
 _SHOWN = (

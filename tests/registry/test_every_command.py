@@ -18,8 +18,7 @@ from maplab_py.console.session.maps import MapsState
 from maplab_py.console.session.session import Refusal, Session
 from maplab_py.console.session.status import Status
 from maplab_py.console.terminal.output import ConsoleTerminal
-from maplab_py.vimap import MissionSensor
-from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap import MissionSensor, to_hex
 from tests.registry import workspace
 from tests.support.data import REPOSITORY
 

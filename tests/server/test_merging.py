@@ -18,9 +18,8 @@ from maplab_py.server.options import IncrementalOptions, MergingOptions
 from maplab_py.server.publishing import Display
 from maplab_py.simulation.evaluation import evaluate_map
 from maplab_py.simulation.scenario import SessionOptions
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import VIMap, without_resources
 from maplab_py.vimap.merge import merge_maps
-from maplab_py.vimap.queries import without_resources
 from tests.algorithms.cloud_registration.test_registration import ROOM, session
 from tests.server.support import TWO_ROBOTS
 from tests.simulation.small import simulated

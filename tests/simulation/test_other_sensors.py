@@ -19,9 +19,8 @@ from maplab_py.simulation.truth import Truth
 from maplab_py.simulation.world import World, make_world
 from maplab_py.storage.native import load_map, save_map
 from maplab_py.storage.resources.store import ResourceStore
-from maplab_py.vimap import MissionSensor, ResourceOwner, TransformationKind
+from maplab_py.vimap import MissionSensor, ResourceOwner, TransformationKind, from_hex, to_hex
 from maplab_py.vimap.consistency import check_consistency
-from maplab_py.vimap.ids import from_hex, to_hex
 from tests.simulation.small import SMALL, simulated
 
 OPTIONS = sim.OtherSensorOptions(

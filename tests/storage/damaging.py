@@ -12,8 +12,7 @@ import numpy as np
 from maplab_py.storage import maplab_map_pb2 as pb
 from maplab_py.storage.checksums import write as write_checksums
 from maplab_py.storage.native import save_map
-from maplab_py.vimap import ResourceOwner, Resources
-from maplab_py.vimap.ids import random_ids
+from maplab_py.vimap import ResourceOwner, Resources, random_ids
 from tests.vimap.builders import walk_map
 
 BOUND_MEGABYTES = 6

@@ -18,8 +18,7 @@ import numpy as np
 from maplab_py.storage.native import load_map, save_map
 from maplab_py.storage.resources.new import NewResources
 from maplab_py.storage.resources.store import ResourceStore
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap import VIMap, to_hex
 from tests.vimap.builders import walk_map
 
 OLD_RESOURCES = 20

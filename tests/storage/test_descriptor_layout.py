@@ -11,9 +11,8 @@ import pytest
 from maplab_py.errors import MapError, UserError
 from maplab_py.storage.native import find_maps, load_map, save_map
 from maplab_py.storage.protobuf.descriptor_layout import read_blocks
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import DescriptorBlock, VIMap
 from maplab_py.vimap.consistency import check_consistency
-from maplab_py.vimap.descriptors import DescriptorBlock
 from maplab_py.vimap.tables import DescriptorLayout
 from tests.storage.test_native import differences
 from tests.support import descriptor_blocks as by_hand

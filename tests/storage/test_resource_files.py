@@ -17,13 +17,11 @@ from maplab_py.storage.resources import files as resource_files
 from maplab_py.storage.resources import store as resource_store
 from maplab_py.storage.resources.new import NewResources
 from maplab_py.storage.resources.types import RESOURCE_TYPES, resource_type, resource_type_of
-from maplab_py.vimap import ResourceOwner, VIMap
+from maplab_py.vimap import ResourceOwner, Resources, VIMap, random_ids
 from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.edits import remove_missions
-from maplab_py.vimap.ids import random_ids
 from maplab_py.vimap.merge import merge_maps
 from maplab_py.vimap.queries import resource_missions, resources_of, without_resources
-from maplab_py.vimap.tables import Resources
 from tests.simulation.small import simulated
 from tests.support.data import shared_data
 

@@ -3,8 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.descriptors import DescriptorBlock, DescriptorDepth, FeatureType
+from maplab_py.vimap import DescriptorBlock, DescriptorDepth, FeatureType, VIMap
 from maplab_py.vimap.table import object_column
 
 

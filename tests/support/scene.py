@@ -16,8 +16,7 @@ from maplab_py.sensors import Camera, CameraRig, Distortion, Imu, ImuIntrinsics,
 from maplab_py.sensors.camera import CAMERA_MODELS
 from maplab_py.sensors.projection import is_inside_image, project
 from maplab_py.sensors.sensor_set import Extrinsics, SensorSet
-from maplab_py.vimap import VIMap, tables
-from maplab_py.vimap.ids import from_hex, random_ids, to_hex
+from maplab_py.vimap import VIMap, from_hex, random_ids, tables, to_hex
 from tests.support.imu_model import distort_imu
 
 F64 = NDArray[np.float64]

@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3
-from maplab_py.vimap import VIMap, edits
+from maplab_py.vimap import DescriptorBlock, VIMap, edits
 from maplab_py.vimap.consistency import check_consistency
-from maplab_py.vimap.descriptors import DescriptorBlock
 from maplab_py.vimap.edits import merge_landmarks, remove_keypoints, with_p_G
 from maplab_py.vimap.excerpts import cut_by_time, excerpt, mission_maps
 from maplab_py.vimap.merge import merge_maps

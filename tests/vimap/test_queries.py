@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from maplab_py.errors import UserError
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import IdIndex, VIMap, random_ids, to_hex
 from maplab_py.vimap import ids as ids_module
 from maplab_py.vimap.comparison import is_same
 from maplab_py.vimap.consistency import check_consistency
-from maplab_py.vimap.ids import IdIndex, random_ids, to_hex
 from maplab_py.vimap.merge import merge_maps
 from maplab_py.vimap.queries import coobservation_counts, find_mission, observer_counts
 from maplab_py.vimap.statistics import coobservability, map_statistics

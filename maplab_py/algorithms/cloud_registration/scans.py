@@ -20,8 +20,7 @@ from maplab_py.geometry import se3
 from maplab_py.geometry.interpolation import interpolate_poses, nearest_rows
 from maplab_py.interop.ply import parse_ply
 from maplab_py.storage.resources.store import ResourceStore
-from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap
-from maplab_py.vimap.ids import as_keys, to_hex
+from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap, as_keys, to_hex
 from maplab_py.vimap.queries import mission_sensor_id, resources_of
 
 CLOUD_TYPES = (16, 17, 21)

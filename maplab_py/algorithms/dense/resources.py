@@ -12,8 +12,7 @@ from maplab_py.geometry import se3
 from maplab_py.interop.images import as_8_bits, as_grey, bits_of, sampled
 from maplab_py.sensors import Camera, CameraRig
 from maplab_py.storage.resources.store import ResourceStore
-from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap
-from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap, to_hex
 from maplab_py.vimap.queries import mission_sensor_id, resources_of
 
 IMAGES = (0, 4)

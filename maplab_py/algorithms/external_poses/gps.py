@@ -17,8 +17,7 @@ from maplab_py.geometry.interpolation import interpolate_poses, interpolate_vect
 from maplab_py.interop.gps import GpsTrack, east_north_up_m
 from maplab_py.sensors import OtherSensor
 from maplab_py.sensors.yaml_entry import Entry
-from maplab_py.vimap import MissionSensor, VIMap
-from maplab_py.vimap.tables import AbsolutePoses
+from maplab_py.vimap import AbsolutePoses, MissionSensor, VIMap
 
 ORIGIN = "enu_origin"
 """Key of the origin in the sensor's entry of sensors.yaml."""

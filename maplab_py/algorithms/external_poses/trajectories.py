@@ -18,9 +18,8 @@ from maplab_py.geometry import se3
 from maplab_py.geometry.interpolation import interpolate_poses
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.sensors import Extrinsics, OtherSensor
-from maplab_py.vimap import MissionSensor, TransformationKind, VIMap, tables
+from maplab_py.vimap import MissionSensor, TransformationKind, VIMap, mission_sensor_id, tables
 from maplab_py.vimap.ids import from_hex, random_ids, to_hex
-from maplab_py.vimap.queries import mission_sensor_id
 
 _ALONG = "odometry of a trajectory"
 _MOTION_DEG = 20.0

@@ -18,9 +18,8 @@ from maplab_py.interop.wheel_odometry import WheelTrack
 from maplab_py.sensors import OtherSensor
 from maplab_py.sensors.wheels import WHEEL_ODOMETRY, wheel_scale
 from maplab_py.sensors.yaml_entry import Entry
-from maplab_py.vimap import MissionSensor, TransformationKind, VIMap
+from maplab_py.vimap import MissionSensor, TransformationKind, VIMap, mission_sensor_id
 from maplab_py.vimap.ids import from_hex, random_ids, to_hex
-from maplab_py.vimap.queries import mission_sensor_id
 from maplab_py.vimap.tables import TransformationEdges
 
 _COVARIANCE = "T_St_Stp1_fixed_covariance"

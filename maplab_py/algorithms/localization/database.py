@@ -11,8 +11,7 @@ from maplab_py.array_types import F64, I64, U64, NDArray
 from maplab_py.distinct import distinct
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.storage.summary_map import SummaryMap
-from maplab_py.vimap import LandmarkQuality, VIMap
-from maplab_py.vimap.descriptors import FeatureType, type_name
+from maplab_py.vimap import FeatureType, LandmarkQuality, VIMap, type_name
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
 from maplab_py.vision.descriptors import DescriptorKind
 from maplab_py.vision.index import DescriptorSet

@@ -10,8 +10,7 @@ from maplab_py.array_types import F64, I64, Mask
 from maplab_py.estimation.terms.pose_graph import RelativePoses
 from maplab_py.geometry import se3, so3, symmetric
 from maplab_py.report import counted
-from maplab_py.vimap import Backbone, TransformationKind, VIMap
-from maplab_py.vimap.tables import LoopClosureEdges
+from maplab_py.vimap import Backbone, LoopClosureEdges, TransformationKind, VIMap
 
 _FLOOR_M_PER_SQRT_S = 0.005  # a standing device drifts too
 _SHORTEST_S = 1e-3  # vertices without times, or with equal ones

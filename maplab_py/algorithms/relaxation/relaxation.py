@@ -34,9 +34,8 @@ from maplab_py.estimation.problem.gauge import clusters
 from maplab_py.estimation.terms.pose_graph import TiltPriors
 from maplab_py.geometry import se3, so3
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import IdIndex, VIMap, to_hex
+from maplab_py.vimap import IdIndex, LoopClosureEdges, VIMap, to_hex
 from maplab_py.vimap.descriptors import type_name, types_of
-from maplab_py.vimap.tables import LoopClosureEdges
 
 _NUM_WORST = 10
 

@@ -31,10 +31,8 @@ from maplab_py.distinct import distinct
 from maplab_py.errors import UserError
 from maplab_py.memory import require_memory
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import LandmarkQuality, VIMap
+from maplab_py.vimap import LandmarkQuality, VIMap, observer_counts, to_hex
 from maplab_py.vimap.edits import remove_landmarks
-from maplab_py.vimap.ids import to_hex
-from maplab_py.vimap.queries import observer_counts
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
 
 _BYTES_PER_OBSERVATION = 400

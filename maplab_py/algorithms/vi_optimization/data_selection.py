@@ -15,9 +15,7 @@ from maplab_py.geometry import so3
 from maplab_py.geometry.triangulation import triangulate
 from maplab_py.memory import require_memory
 from maplab_py.report import counted
-from maplab_py.vimap import LandmarkQuality, VIMap
-from maplab_py.vimap.descriptors import type_name, type_of_name
-from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap import LandmarkQuality, VIMap, to_hex, type_name, type_of_name
 from maplab_py.vimap.queries import is_metric
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
 

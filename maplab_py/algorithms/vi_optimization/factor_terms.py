@@ -28,8 +28,7 @@ from maplab_py.progress import Progress
 from maplab_py.sensors import Imu
 from maplab_py.sensors.imu import gravity_mps2
 from maplab_py.sensors.wheels import wheel_scale
-from maplab_py.vimap import MissionSensor, TransformationKind, VIMap
-from maplab_py.vimap.ids import from_hex, to_hex
+from maplab_py.vimap import MissionSensor, TransformationKind, VIMap, from_hex, to_hex
 from maplab_py.vimap.queries import mission_sensor_id
 
 # The difference between measured and estimated positions changes slowly, by the drift of the trajectory;

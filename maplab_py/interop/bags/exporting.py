@@ -16,8 +16,7 @@ from maplab_py.interop.recordings import bag_layouts, bag_writing
 from maplab_py.interop.recordings.map_replay import mission_sample_rows
 from maplab_py.progress import SILENT, Progress
 from maplab_py.storage.resources.store import ResourceStore
-from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap
-from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap, to_hex
 from maplab_py.vimap.queries import mission_labels, mission_sensor_id, resources_of
 
 IMAGES, _DEPTH, _CLOUDS = (0, 4), (8,), (16, 17, 21)

@@ -24,7 +24,7 @@ from maplab_py.interop.colmap.undistortion import undistorted
 from maplab_py.output_files import check_writable, write_bytes
 from maplab_py.sensors import Camera
 from maplab_py.sensors.projection import project
-from maplab_py.vimap import MissionSensor, VIMap
+from maplab_py.vimap import LandmarkQuality, MissionSensor, VIMap, from_hex, is_valid
 from maplab_py.vimap.descriptors import (
     DescriptorDepth,
     FeatureType,
@@ -33,10 +33,8 @@ from maplab_py.vimap.descriptors import (
     types_of,
 )
 from maplab_py.vimap.edits import remove_keypoints
-from maplab_py.vimap.ids import from_hex, is_valid
 from maplab_py.vimap.queries import is_metric, mission_labels, mission_sensor_id
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
-from maplab_py.vimap.tables import LandmarkQuality
 
 DATABASE = "database.db"
 _CHUNK_BYTES = 1 << 24

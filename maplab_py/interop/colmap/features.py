@@ -13,9 +13,8 @@ from maplab_py.input_files import read_bytes
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import counted
 from maplab_py.storage.resources.new import NewResources
-from maplab_py.vimap import MissionSensor, VIMap
+from maplab_py.vimap import MissionSensor, VIMap, mission_sensor_id
 from maplab_py.vimap.descriptors import DescriptorBlock, DescriptorDepth, FeatureType
-from maplab_py.vimap.queries import mission_sensor_id
 from maplab_py.vimap.table import object_column
 
 _SIFT, _UNDEFINED = 0, -1

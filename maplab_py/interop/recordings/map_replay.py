@@ -7,9 +7,8 @@ import numpy as np
 from maplab_py.array_types import I64
 from maplab_py.errors import MapError
 from maplab_py.interop.recordings import protocol
-from maplab_py.vimap import VIMap, mission_sensor_id, ragged_rows, to_hex
+from maplab_py.vimap import MissionSensor, VIMap, mission_sensor_id, ragged_rows, to_hex
 from maplab_py.vimap.descriptors import DescriptorDepth, FeatureType, sizes_of_type, types_of
-from maplab_py.vimap.tables import MissionSensor
 
 
 def mission_sample_rows(vi_map: VIMap, mission: int) -> I64:

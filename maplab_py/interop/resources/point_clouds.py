@@ -16,8 +16,7 @@ from maplab_py.report import counted
 from maplab_py.sensors import CameraRig
 from maplab_py.storage.resources.new import NewResources
 from maplab_py.storage.resources.types import resource_type
-from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap
-from maplab_py.vimap.ids import from_hex, to_hex
+from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap, from_hex, to_hex
 from maplab_py.vimap.queries import mission_sensor_id, mission_time_spans_ns
 
 # Source: The PCD file format, documentation of PCL, version 0.7.

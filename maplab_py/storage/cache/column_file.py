@@ -27,9 +27,8 @@ from numpy.typing import NDArray
 from maplab_py.atomic import replaced_file
 from maplab_py.cancellation import check_cancelled
 from maplab_py.storage.checksums import map_in_threads
-from maplab_py.vimap import DescriptorBlock, VIMap
+from maplab_py.vimap import DescriptorBlock, Missions, VIMap
 from maplab_py.vimap.table import Table, object_column, ragged_rows, starts_of_counts
-from maplab_py.vimap.tables import Missions
 
 _MAGIC = b"maplab-py columns 1\n"
 _SIZES = struct.Struct("<QI")

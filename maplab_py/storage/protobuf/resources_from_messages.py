@@ -12,8 +12,7 @@ from maplab_py.storage.protobuf import map_files
 from maplab_py.storage.protobuf.ids import ids_of
 from maplab_py.storage.protobuf.scan import MemoryBudget
 from maplab_py.storage.protobuf.tables_from_messages import Content
-from maplab_py.vimap import MapMetadata, ResourceOwner, as_keys
-from maplab_py.vimap.tables import Resources
+from maplab_py.vimap import MapMetadata, ResourceOwner, Resources, as_keys
 
 
 def read_metadata(folder: Path, max_bytes: int) -> tuple[MapMetadata, list[str]]:

@@ -17,9 +17,8 @@ from maplab_py.storage.protobuf import frames_from_messages as frame_messages
 from maplab_py.storage.protobuf import resources_from_messages, tables_from_messages
 from maplab_py.storage.protobuf.ids import ids_of, ids_of_field
 from maplab_py.storage.protobuf.message_numbers import Name
-from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap import AbsolutePoses, Frames, Keypoints, Landmarks, Resources, Vertices, to_hex
 from maplab_py.vimap.table import Table, ragged_rows, stacked_columns, starts_of_counts
-from maplab_py.vimap.tables import AbsolutePoses, Frames, Keypoints, Landmarks, Resources, Vertices
 
 T = TypeVar("T", bound=Table)
 NO_TIME = np.iinfo(np.int64).min

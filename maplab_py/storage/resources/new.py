@@ -17,9 +17,8 @@ from maplab_py.atomic.files import make_folders, remove_folders
 from maplab_py.cancellation import check_cancelled, cleaned_up, lasting_effect, provisional_effects
 from maplab_py.storage.resources.store import MAP_FOLDER, path_in_folder
 from maplab_py.storage.resources.types import resource_type
-from maplab_py.vimap import IdArray, ResourceOwner, VIMap, to_hex
+from maplab_py.vimap import IdArray, ResourceOwner, Resources, VIMap, to_hex
 from maplab_py.vimap.staged_folder import StagedFolder
-from maplab_py.vimap.tables import Resources
 
 RAW_IMAGES = 0
 """Number of the resource type of grey images as recorded."""

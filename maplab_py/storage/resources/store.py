@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from maplab_py.atomic import replaced_file
 from maplab_py.errors import MapError
 from maplab_py.storage.resources.types import resource_type
-from maplab_py.vimap import VIMap, to_hex
-from maplab_py.vimap.tables import Resources
+from maplab_py.vimap import Resources, VIMap, to_hex
 
 MAP_FOLDER = -1
 _IMAGE_SUFFIXES = (".pgm", ".ppm")

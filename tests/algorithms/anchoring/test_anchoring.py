@@ -10,8 +10,7 @@ from maplab_py.algorithms.anchoring.absolute import AbsoluteAnchoringOptions
 from maplab_py.algorithms.anchoring.anchoring import anchor_missions
 from maplab_py.algorithms.anchoring.options import AnchoringOptions
 from maplab_py.geometry import se3, so3, yaw
-from maplab_py.vimap import AbsolutePoses
-from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap import AbsolutePoses, to_hex
 from tests.algorithms.loop_closure.rooms import Walk, make_map
 
 

@@ -9,12 +9,10 @@ from maplab_py.algorithms.evaluation.map_comparison import compare_maps
 from maplab_py.console.session.session import Session
 from maplab_py.errors import FlagError, MapError, UserError
 from maplab_py.geometry import se3
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import LoopClosureEdges, VIMap, to_hex_list
 from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.edits import merge_landmarks, remove_landmarks
-from maplab_py.vimap.ids import to_hex_list
 from maplab_py.vimap.merge import merge_maps
-from maplab_py.vimap.tables import LoopClosureEdges
 from tests.simulation.small import simulated
 
 

@@ -23,9 +23,7 @@ from maplab_py.simulation.evaluation import evaluate_map
 from maplab_py.simulation.simulate import Lidar, simulate
 from maplab_py.simulation.truth import Truth
 from maplab_py.simulation.world import World, make_world
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.ids import IdIndex, to_hex
-from maplab_py.vimap.queries import without_resources
+from maplab_py.vimap import IdIndex, VIMap, to_hex, without_resources
 from tests.simulation.small import simulated
 
 ROOM = sim.WorldOptions(landmarks_per_room=200)

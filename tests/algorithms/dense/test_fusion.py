@@ -20,9 +20,8 @@ from maplab_py.interop.ply import PlyCloud, encode_ply
 from maplab_py.interop.resources.depth_maps import import_depth_maps
 from maplab_py.memory import NotEnoughMemory, memory_limited
 from maplab_py.storage.resources.new import NewResources
-from maplab_py.vimap import ResourceOwner, VIMap
+from maplab_py.vimap import ResourceOwner, VIMap, resources_of, without_resources
 from maplab_py.vimap.merge import merge_maps
-from maplab_py.vimap.queries import resources_of, without_resources
 from tests.support.stereo_room import StereoRoom
 
 OPTIONS = FusionOptions(voxel_size_m=0.1)

@@ -25,8 +25,7 @@ from maplab_py.sensors.camera import CAMERA_MODELS
 from maplab_py.sensors.projection import back_project, is_inside_image, project
 from maplab_py.storage.resources.new import NewResources
 from maplab_py.storage.resources.store import ResourceStore
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.queries import resources_of, without_resources
+from maplab_py.vimap import VIMap, resources_of, without_resources
 from tests.support.stereo_room import StereoRoom
 
 WIDTH, HEIGHT = 160, 120

@@ -14,8 +14,7 @@ from maplab_py.algorithms.evaluation.trajectory_evaluation import evaluate_traje
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.trajectories import Trajectory, read_trajectory
-from maplab_py.vimap import BaseFrames, Missions, Vertices, VIMap, ids
-from maplab_py.vimap.tables import LandmarkQuality
+from maplab_py.vimap import BaseFrames, LandmarkQuality, Missions, Vertices, VIMap, ids
 from tests.interop.small_map import make_map
 from tests.support.association import associate
 from tests.support.data import shared_data

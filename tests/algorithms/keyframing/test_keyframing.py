@@ -14,9 +14,8 @@ from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Imu
 from maplab_py.simulation.scenario import MeasurementOptions, Scenario, SessionOptions
 from maplab_py.simulation.simulate import simulate
-from maplab_py.vimap import AbsolutePoses, LoopClosureEdges, VIMap
+from maplab_py.vimap import AbsolutePoses, IdIndex, LoopClosureEdges, VIMap
 from maplab_py.vimap.consistency import check_consistency
-from maplab_py.vimap.ids import IdIndex
 from maplab_py.vimap.merge import merge_maps
 from tests.simulation.small import simulated
 from tests.support.machine import slowness

@@ -17,10 +17,9 @@ from maplab_py.algorithms.landmarks.triangulation import retriangulate
 from maplab_py.algorithms.loop_closure.workflow import close_loops
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
-from maplab_py.vimap import LandmarkQuality, VIMap
+from maplab_py.vimap import LandmarkQuality, VIMap, ragged_rows
 from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.edits import remove_landmarks, remove_observations, with_p_G
-from maplab_py.vimap.table import ragged_rows
 from tests.algorithms.loop_closure.rooms import Walk, make_map
 from tests.vimap.builders import walk_map
 

@@ -29,9 +29,8 @@ from maplab_py.interop.recordings.protocol import ImuBatch
 from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.simulation.scenario import MeasurementOptions, Scenario, SessionOptions, WorldOptions
 from maplab_py.simulation.simulate import simulate
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import IdIndex, VIMap
 from maplab_py.vimap.descriptors import binary_blocks
-from maplab_py.vimap.ids import IdIndex
 from maplab_py.vision.descriptors import pack_words
 from tests.frontend.localization.places import place, summary
 from tests.support.noiseless import without_noise

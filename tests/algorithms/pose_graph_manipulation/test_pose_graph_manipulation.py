@@ -18,10 +18,9 @@ from maplab_py.algorithms.pose_graph_manipulation.layout import (
 from maplab_py.algorithms.pose_graph_manipulation.stationary_options import StationaryOptions
 from maplab_py.errors import FlagError, UserError
 from maplab_py.geometry import se3, so3
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import VIMap, to_hex
 from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.edits import remove_loop_closure_edges
-from maplab_py.vimap.ids import to_hex
 from maplab_py.vimap.merge import merge_maps
 from tests.simulation.small import simulated
 from tests.vimap.builders import walk_map

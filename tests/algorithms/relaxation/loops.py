@@ -6,9 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.geometry import se3, so3
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.ids import random_ids
-from maplab_py.vimap.tables import BaseFrames, LoopClosureEdges, Missions, Vertices
+from maplab_py.vimap import BaseFrames, LoopClosureEdges, Missions, Vertices, VIMap, random_ids
 
 F64 = NDArray[np.float64]
 SIGMA_M, SIGMA_DEG = 0.03, 0.5

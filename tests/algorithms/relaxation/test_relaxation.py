@@ -20,8 +20,7 @@ from maplab_py.progress import SilentProgress
 from maplab_py.simulation.evaluation import evaluate_map
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate as simulate_scenario
-from maplab_py.vimap.ids import random_ids, to_hex
-from maplab_py.vimap.tables import Landmarks, LoopClosureEdges
+from maplab_py.vimap import Landmarks, LoopClosureEdges, random_ids, to_hex
 from tests.algorithms.relaxation.loops import Loop, ate, simulate
 
 OPTIONS = RelaxationOptions()

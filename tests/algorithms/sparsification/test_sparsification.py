@@ -18,10 +18,9 @@ from maplab_py.algorithms.sparsification.sparsify import (
     split,
 )
 from maplab_py.errors import FlagError, UserError
-from maplab_py.vimap import LandmarkQuality, VIMap
+from maplab_py.vimap import LandmarkQuality, VIMap, observer_counts
 from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.merge import merge_maps
-from maplab_py.vimap.queries import observer_counts
 from tests.algorithms.sparsification.instances import corridor
 from tests.simulation.small import simulated as small_data
 from tests.vimap.builders import walk_map

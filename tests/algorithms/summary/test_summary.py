@@ -10,8 +10,7 @@ from maplab_py.algorithms.loop_closure.features import findable_landmarks, map_f
 from maplab_py.algorithms.summary.options import SummaryMapOptions
 from maplab_py.algorithms.summary.summary import landmark_covariances, make_summary_map
 from maplab_py.errors import EstimationError
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.ids import IdIndex
+from maplab_py.vimap import IdIndex, VIMap
 from tests.simulation.small import SMALL, simulated
 from tests.support.noiseless import without_noise
 

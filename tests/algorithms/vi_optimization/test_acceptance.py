@@ -17,9 +17,7 @@ from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.algorithms.vi_optimization.reports import VIOptimizationReport
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors.sensor_set import Extrinsics, OtherSensor
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.ids import from_hex, random_ids
-from maplab_py.vimap.tables import AbsolutePoses, LoopClosureEdges
+from maplab_py.vimap import AbsolutePoses, LoopClosureEdges, VIMap, from_hex, random_ids
 from tests.support.scene import Scene, corrupted
 
 OPTIONS = VIOptimizationOptions()

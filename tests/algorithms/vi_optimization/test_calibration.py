@@ -13,8 +13,7 @@ from maplab_py.sensors import CameraRig
 from maplab_py.simulation import scenario as sim
 from maplab_py.simulation.evaluation import evaluate_map
 from maplab_py.simulation.simulate import SimulatedData, simulate
-from maplab_py.vimap import MissionSensor, VIMap
-from maplab_py.vimap.tables import AbsolutePoses
+from maplab_py.vimap import AbsolutePoses, MissionSensor, VIMap
 from tests.support.scene import Scene, corrupted
 
 

@@ -17,8 +17,7 @@ from maplab_py.estimation.linear import supernodal_solver
 from maplab_py.estimation.problem.iterative import IterativeProblem
 from maplab_py.memory import NotEnoughMemory
 from maplab_py.progress import SilentProgress
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap import VIMap, to_hex
 from tests.support.scene import Scene, corrupted
 
 OPTIONS = VIOptimizationOptions(function_tolerance=0.0, parameter_tolerance=0.0)

@@ -18,9 +18,8 @@ from maplab_py.estimation.terms.pose import AbsolutePoseTerm, RelativePoseTerm
 from maplab_py.geometry import se3
 from maplab_py.progress import SILENT
 from maplab_py.sensors import Distortion, Projection
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import VIMap, ragged_rows
 from maplab_py.vimap.edits import remove_observations
-from maplab_py.vimap.table import ragged_rows
 from tests.support.dense import DenseProblem, dense_problem
 from tests.support.scene import Scene, corrupted
 

@@ -13,8 +13,7 @@ from maplab_py.interop.resources.depth_maps import RAW_DEPTH_MAPS, encoded_depth
 from maplab_py.interop.resources.point_clouds import XYZ, XYZI, XYZRGB
 from maplab_py.sensors import CameraRig, Distortion
 from maplab_py.storage.resources.new import NewResources
-from maplab_py.vimap import ResourceOwner, VIMap
-from maplab_py.vimap.ids import from_hex
+from maplab_py.vimap import ResourceOwner, VIMap, from_hex
 from tests.interop.small_map import CAMERA_ID, IMU_ID, RIG_ID, VERTICES, make_map
 
 FORMATS = list(BagFormat)

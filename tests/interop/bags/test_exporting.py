@@ -33,8 +33,7 @@ from maplab_py.interop.vertex_states import poses_at
 from maplab_py.progress import SilentProgress
 from maplab_py.sensors import Projection
 from maplab_py.sensors.sensors_yaml import write_sensors
-from maplab_py.vimap import LandmarkQuality, VIMap
-from maplab_py.vimap.tables import LoopClosureEdges
+from maplab_py.vimap import LandmarkQuality, LoopClosureEdges, VIMap
 from tests.interop.bags import small_bags
 from tests.interop.recordings.written import frame_sets, make_content, samples, write_bag
 from tests.interop.small_map import PERIOD_NS, VERTICES, make_map

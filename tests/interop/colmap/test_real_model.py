@@ -18,10 +18,9 @@ from maplab_py.interop.colmap.features import with_images
 from maplab_py.interop.colmap.importing import import_colmap
 from maplab_py.interop.colmap.options import ColmapImportOptions
 from maplab_py.interop.trajectories import Trajectory, read_trajectory
-from maplab_py.vimap import BaseFrames, Frames, Missions, MissionSensor, Vertices, VIMap
+from maplab_py.vimap import BaseFrames, Frames, Missions, MissionSensor, Vertices, VIMap, random_ids
 from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.descriptors import FeatureType
-from maplab_py.vimap.ids import random_ids
 from tests.support.data import shared_data
 
 RECONSTRUCT = Path(__file__).with_name("reconstruct.py")

@@ -21,8 +21,7 @@ from maplab_py.interop.resources.point_clouds import import_point_clouds
 from maplab_py.storage.native import load_map, save_map
 from maplab_py.storage.resources.files import missing_files
 from maplab_py.storage.resources.store import ResourceStore, resource_path
-from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap
-from maplab_py.vimap.queries import mission_sensor_id
+from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap, mission_sensor_id
 from tests.support.stereo_room import StereoRoom
 
 
