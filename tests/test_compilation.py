@@ -1,7 +1,5 @@
 """Machine code of kernels: found by content, in the wheel or in the user's cache."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import subprocess

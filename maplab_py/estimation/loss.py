@@ -1,7 +1,5 @@
 """Robust losses: which one, and how far a residual may go before it counts less."""
 
-from __future__ import annotations
-
 from enum import IntEnum
 
 

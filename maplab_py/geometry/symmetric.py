@@ -8,8 +8,6 @@ Source: Golub and Van Loan, Matrix Computations, 4th ed., algorithms 8.5.2 (cycl
 (Cholesky).
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

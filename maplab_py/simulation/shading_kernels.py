@@ -8,8 +8,6 @@ sees that they do not overlap.
 Source: the choice of the pyramid level is that of Williams (1983).
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

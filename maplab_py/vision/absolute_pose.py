@@ -5,8 +5,6 @@ suffice even at a high outlier ratio. Every improved hypothesis is refined with 
 freedom (MSAC with local optimisation: Torr and Zisserman 2000, Chum et al. 2003).
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

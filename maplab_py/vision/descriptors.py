@@ -1,7 +1,5 @@
 """Descriptors of any length: packing of bits into words, Hamming and squared distances."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Match the keypoints of two images of known poses: similar descriptors on epipolar lines."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

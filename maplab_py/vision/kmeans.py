@@ -1,7 +1,5 @@
 """Vocabularies by k-means: seeded, and the same for any thread count."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.array_types import F32, I32

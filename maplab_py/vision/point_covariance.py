@@ -4,8 +4,6 @@ Every keypoint contributes information across its ray, with the inverse square o
 distance, and none along the ray.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -5,8 +5,6 @@ the points. Hypotheses are T_M_W: yaw and position from two matches. The refinem
 pitch, held by a prior.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -6,8 +6,6 @@ distance is (up to a constant) the log likelihood ratio of "different" against "
 Source: Lynen 2015, section IV; Bosse and Zlot 2013.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import io
 from functools import cached_property

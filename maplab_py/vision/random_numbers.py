@@ -1,7 +1,5 @@
 """Random numbers of compiled kernels, the same on every machine and for any number of threads."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.compilation import compiled

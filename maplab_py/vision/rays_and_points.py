@@ -1,7 +1,5 @@
 """Points near rays: candidates for matches when the pose is known."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -4,8 +4,6 @@ Queries and database descriptors are `index.DescriptorColumns`: equal labels and
 near times are no match. A search keeps the k nearest of distinct labels.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Merge pairs of tracks unless an image would contain two keypoints of one track."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.array_types import I64, NDArray

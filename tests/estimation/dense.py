@@ -1,7 +1,5 @@
 """A dense reference for `Problem`: residuals by calling terms, Jacobians by central differences."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 

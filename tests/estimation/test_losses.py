@@ -1,7 +1,5 @@
 """Losses against finite differences, and compiled dense blocks against numpy."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

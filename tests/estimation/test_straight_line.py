@@ -1,7 +1,5 @@
 """Functions lowered to instructions give what Python gives, and refuse what has no instruction."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from maplab_py.estimation.codegen.kernels import residual_kernel
 from maplab_py.estimation.symbolic import sources
 from maplab_py.estimation.warmup import optimizer_jobs

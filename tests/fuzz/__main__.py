@@ -4,8 +4,6 @@ The corpus of each reader grows in its folder; an input that fails is written be
 belongs into tests/fuzz/findings/READER once it is mended.
 """
 
-from __future__ import annotations
-
 import argparse
 import inspect
 import os

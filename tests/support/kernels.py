@@ -1,7 +1,5 @@
 """Compile all kernels before tests start in several processes, so that none is compiled twice."""
 
-from __future__ import annotations
-
 import time
 
 from maplab_py.compilation import TARGET

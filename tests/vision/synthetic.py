@@ -1,7 +1,5 @@
 """Synthetic binary descriptors with correlated noise, and poses with matches."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Covariances of points from their rays."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.vision.point_covariance import covariance_by_rays

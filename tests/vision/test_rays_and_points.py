@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.vision.rays_and_points import Rays, points_near_rays

@@ -4,8 +4,6 @@ Blocks have 8 x 8 x 8 voxels. They are found by a hash table with open addressin
 coordinates of a block and the row of the block in the arrays of the grid; a free row has the key -1.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.array_types import F32, F64, I32, I64

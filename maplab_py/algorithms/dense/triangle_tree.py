@@ -1,7 +1,5 @@
 """Distances of points from the triangles of a mesh, by a tree of boxes."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.array_types import F64, I32, I64

@@ -15,8 +15,6 @@ rivals that the closures between the two do not show, because one of them never 
 place. Such a pair stays open.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 

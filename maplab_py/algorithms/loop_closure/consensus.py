@@ -6,8 +6,6 @@ queries and between the places (Mangelson 2018: pairwise consistency, here restr
 to neighbours).
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 

@@ -4,8 +4,6 @@
 (`GateValues`), and `closure_gates` makes the table of gates from it for reports.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from typing import Any

@@ -1,7 +1,5 @@
 """List the recorded closures as a table, JSON or CSV."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import io

@@ -1,7 +1,5 @@
 """Merge landmarks that verified closures identify as the same point."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Options of loop closure."""
 
-from __future__ import annotations
-
 from maplab_py.errors import FlagError
 from maplab_py.options import Options, option
 from maplab_py.vimap.descriptors import FeatureType, type_of_name

@@ -1,7 +1,5 @@
 """Write closures and merges into the map's record and read what later searches need."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Close loops by merging landmarks or by adding edges to the pose graph."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Block-sparse Cholesky of matrices that are given as a list of blocks."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

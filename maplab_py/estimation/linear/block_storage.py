@@ -6,8 +6,6 @@ where that is its row. Columns follow each other, `leading` numbers apart, so th
 kept to add the blocks again.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

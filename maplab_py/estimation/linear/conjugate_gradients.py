@@ -8,8 +8,6 @@ The test of Nash and Sofer (the gain of an iteration against the gain so far) is
 of poses progress comes in plateaus, where that test stops too early.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 

@@ -6,8 +6,6 @@ in the graph alone (Karypis and Kumar 1998, multilevel nested dissection). Where
 installed the places of the nodes in space tell where to cut.
 """
 
-from __future__ import annotations
-
 import importlib.util
 
 import numpy as np

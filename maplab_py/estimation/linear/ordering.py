@@ -4,8 +4,6 @@ Minimum degree suits single sessions; trajectories that overlap want nested diss
 is better is not guessed: the operations that a factorisation would take are counted for both.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from enum import Enum
 

@@ -1,7 +1,5 @@
 """Size of factors, and the error of matrices that have none."""
 
-from __future__ import annotations
-
 import dataclasses
 
 from maplab_py.errors import EstimationError

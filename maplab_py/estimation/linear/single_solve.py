@@ -4,8 +4,6 @@ Panels of L are columns of a front, see `symbolic.FrontPlan`; each is read once 
 tree and once on the way down. The order of sums is fixed.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -19,8 +19,6 @@ computed on its own, into the panel itself if the rows lie side by side there.
 Everything is sequential and ordered, so results are the same bits each time.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.array_types import F64, I64

@@ -15,8 +15,6 @@ With nodes numbered in elimination order:
 4. FRONTS: the rows of a supernode's panel, and where the rows below it lie in its parent's front.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple

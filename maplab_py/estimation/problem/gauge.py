@@ -5,8 +5,6 @@ heading of one vertex per cluster are free to choose (4 dimensions). With images
 and scale are too (7). Clusters are sets of vertices that terms join.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.array_types import F64, I64

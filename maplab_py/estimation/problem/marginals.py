@@ -4,8 +4,6 @@ The gauge is that of the problem: what is held has no variance, and covariances 
 With robust losses the weights at the optimum count, so down-weighted measurements tell little.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -11,8 +11,6 @@ Edges that join vertices far apart, such as loop closures, would fill the factor
 diagonal blocks of their vertices are taken, unless an edge joins two parts that nothing else joins.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A least-squares problem: terms, which nodes may move, and its normal equations."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial

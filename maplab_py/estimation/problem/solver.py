@@ -1,7 +1,5 @@
 """Levenberg-Marquardt over a `protocol.LeastSquares` problem (trust region: see `trust_region`)."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections import deque

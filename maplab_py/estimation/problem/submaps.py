@@ -9,8 +9,6 @@ are those of the joint problem but for the order of sums, and so are costs and t
 A part is a submap or a separator; see `linear.submap_plan`.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial

@@ -3,8 +3,6 @@
 Damping is 1 / radius times the clamped diagonal of the normal equations (Levenberg-Marquardt).
 """
 
-from __future__ import annotations
-
 from enum import Enum
 
 import numpy as np

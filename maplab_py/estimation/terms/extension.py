@@ -14,8 +14,6 @@ Example, a barometer that measures heights::
 the residuals of the project itself.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import inspect

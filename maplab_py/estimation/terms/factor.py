@@ -1,7 +1,5 @@
 """Cost and normal equations of factor terms."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 

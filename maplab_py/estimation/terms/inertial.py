@@ -1,7 +1,5 @@
 """Inertial edges and the random walk of their biases, as factor terms."""
 
-from __future__ import annotations
-
 from types import ModuleType
 
 import numpy as np

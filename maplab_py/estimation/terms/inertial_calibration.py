@@ -1,7 +1,5 @@
 """Inertial edges whose IMUs are calibrated: scale, misalignment and R_A_I are states."""
 
-from __future__ import annotations
-
 import dataclasses
 from types import ModuleType
 

@@ -1,7 +1,5 @@
 """Priors: what is known of states before any measurement."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.array_types import F64, I64

@@ -4,8 +4,6 @@ A factor has a residual of size m and touches a list of nodes (three numbers eac
 Jacobian (m, 3 * nodes) has the columns of the nodes side by side.
 """
 
-from __future__ import annotations
-
 from types import ModuleType
 from typing import Protocol
 

@@ -1,7 +1,5 @@
 """The reduced system of the visual terms as an operator: kept Jacobians, products, diagonal blocks."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

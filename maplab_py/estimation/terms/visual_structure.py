@@ -10,8 +10,6 @@ Landmarks are eliminated SLAB by slab. What a landmark leaves with each of its o
 and what a slab leaves is still in the processor's cache when the rows ask for it.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

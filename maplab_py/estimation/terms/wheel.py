@@ -1,7 +1,5 @@
 """Relative poses of wheel odometry, whose distances have a scale that is estimated."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -4,8 +4,6 @@ Source: Oleynikova et al., Real-Time Visual-Inertial Localization for Aerial and
 as Schneider 2019, Paper I, section 4.1 describes it.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

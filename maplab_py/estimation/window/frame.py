@@ -1,7 +1,5 @@
 """Input and result of the smoother for a frame, and the state it starts from."""
 
-from __future__ import annotations
-
 import dataclasses
 from enum import Enum
 

@@ -1,7 +1,5 @@
 """The inertial edges between neighbouring frames of a window, as a chain that grows and shrinks."""
 
-from __future__ import annotations
-
 from types import ModuleType
 
 import numpy as np

@@ -4,8 +4,6 @@ Source: Schneider 2019, Paper I, sections 3.2 and 3.3. T_G_M has six numbers, a 
 both frames are level, and a place in the marginal prior, like the states of the frames.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -6,8 +6,6 @@ is known, or a state with a prior N(p_G, Sigma_G) that is eliminated with all it
 several views of a wrong landmark are not independent facts.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

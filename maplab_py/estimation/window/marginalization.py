@@ -1,7 +1,5 @@
 """Marginalization: states that leave the window become a prior on those that stay."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

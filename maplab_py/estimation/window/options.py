@@ -1,7 +1,5 @@
 """Options of the fixed-lag smoother."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

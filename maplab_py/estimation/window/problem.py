@@ -1,7 +1,5 @@
 """A window as a least-squares problem: one dense system, landmarks eliminated as it is filled in."""
 
-from __future__ import annotations
-
 import dataclasses
 from types import ModuleType
 

@@ -5,8 +5,6 @@ Optimization, IJRR 2015, section 4.2; of the marginal prior: Usenko et al., Visu
 Non-Linear Factor Recovery, RA-L 2020, section IV.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections.abc import Iterator

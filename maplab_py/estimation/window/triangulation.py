@@ -1,7 +1,5 @@
 """Tracks that become landmarks: enough parallax, and errors as small as their uncertainty allows."""
 
-from __future__ import annotations
-
 from types import ModuleType
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Turning on the spot: told from slow motion by parallax over a longer time, and by a velocity of zero."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.array_types import F64, I64

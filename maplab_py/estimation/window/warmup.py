@@ -1,7 +1,5 @@
 """Compile the kernels of the window by running each once on a tiny window."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 

@@ -4,8 +4,6 @@ Every count is checked against the bytes that are there: COLMAP's own reader doe
 file, it takes what memory holds for the missing part, or never returns.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator
 from pathlib import Path

@@ -3,8 +3,6 @@
 An object per id takes ten times as long as its two numbers; maps have millions of them.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Compiled walk over the fields of a message."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -4,8 +4,6 @@ Source: J.-Y. Bouguet, Pyramidal Implementation of the Affine Lucas Kanade Featu
 as OpenCV implements it; every keypoint is tracked by itself, whatever the number of threads.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

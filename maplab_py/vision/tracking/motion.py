@@ -1,7 +1,5 @@
 """Motion of a camera between two images: outliers, disparity without the turn, turns on the spot."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import NamedTuple
 

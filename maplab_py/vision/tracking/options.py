@@ -1,7 +1,5 @@
 """Options of tracking, with maplab's flag names where it has them."""
 
-from __future__ import annotations
-
 import math
 
 from maplab_py.errors import FlagError

@@ -4,8 +4,6 @@ Source: S. Baker, I. Matthews, Lucas-Kanade 20 Years On, IJCV 2004 (inverse comp
 Good Features to Track, CVPR 1994 (affine motion since the first image tells whether a track drifts).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.compilation import compiled, prange

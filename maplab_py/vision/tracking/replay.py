@@ -1,7 +1,5 @@
 """Keypoints that are tracked already, as those of a map, in place of images."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from typing import Protocol

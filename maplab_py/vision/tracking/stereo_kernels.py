@@ -1,7 +1,5 @@
 """Compiled kernels of stereo: where a point is sought, and whether two rays meet in front of the cameras."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.compilation import compiled

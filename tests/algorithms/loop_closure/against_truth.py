@@ -1,7 +1,5 @@
 """Closures of simulated sessions against the truth: precision, recall, and how noisy bits were."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rooms full of points with descriptors, walked through once or more: small maps with known truth."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Closing of loops between simulated sessions, and landmarks that become one."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The record of closures, and why each of them was refused."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re

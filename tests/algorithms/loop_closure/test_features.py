@@ -1,7 +1,5 @@
 """Features that take part, of one type or of several."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

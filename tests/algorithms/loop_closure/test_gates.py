@@ -1,7 +1,5 @@
 """Gates and consensus on closures made by hand, places that look alike, edges of what is accepted."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import cache
 from types import SimpleNamespace

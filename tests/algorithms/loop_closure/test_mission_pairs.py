@@ -1,7 +1,5 @@
 """Alignments between two missions and over many, and when one of them wins."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

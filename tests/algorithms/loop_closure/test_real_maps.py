@@ -1,7 +1,5 @@
 """Loop closure on recorded maps and between simulated sessions: what is there, and nothing else."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

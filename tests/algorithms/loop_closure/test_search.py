@@ -1,7 +1,5 @@
 """Searches: retrieval, scope, memory of earlier ones, guided matching."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Analytic motions with their exact IMU readings."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Preintegration and propagation against closed forms and on recorded samples."""
 
-from __future__ import annotations
-
 import time
 
 import numpy as np

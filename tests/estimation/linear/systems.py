@@ -1,7 +1,5 @@
 """Random symmetric positive definite block systems of many structures."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

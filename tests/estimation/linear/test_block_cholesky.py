@@ -1,7 +1,5 @@
 """Symbolic analysis, factors of blocks and supernodes, and their threads."""
 
-from __future__ import annotations
-
 import numba
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Orderings, and conjugate gradients without one."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """Conjugate gradients over the whole problem, and their preconditioner."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numba

@@ -1,7 +1,5 @@
 """Marginals against the dense inverse, and costs against Ceres and GTSAM."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import chi2

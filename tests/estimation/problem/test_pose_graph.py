@@ -1,7 +1,5 @@
 """Normal equations of pose graphs against finite differences of the cost, steps, uncertainty."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Problems: residuals, steps uphill, trust region."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Submaps give the steps of the direct solver, in less memory."""
 
-from __future__ import annotations
-
 import itertools
 import tempfile
 from pathlib import Path

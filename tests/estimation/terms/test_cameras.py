@@ -1,7 +1,5 @@
 """Cameras, terms and symbolic residuals: derivatives against finite differences."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

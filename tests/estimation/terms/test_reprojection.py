@@ -1,7 +1,5 @@
 """Reprojection of every camera model, and the structure of visual problems."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A hash of all that a run estimates, to compare processes: `python -m tests.estimation.window.digest`."""
 
-from __future__ import annotations
-
 import hashlib
 
 import numpy as np

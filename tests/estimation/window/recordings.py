@@ -1,7 +1,5 @@
 """Simulated sessions as frames of the smoother, with the truth."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What of the cameras' calibration a window estimates beside the motion."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

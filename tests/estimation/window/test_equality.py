@@ -1,7 +1,5 @@
 """A window and the general problem have the same minimum."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The chain of inertial edges: joining, predicting, integrating again."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The smoother localised in a map: exactness, consistency, use of information, and re-initialisation."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

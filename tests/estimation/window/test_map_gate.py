@@ -1,7 +1,5 @@
 """The gate of observations of a map."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

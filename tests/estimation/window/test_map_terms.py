@@ -1,7 +1,5 @@
 """Observations of a map against numeric derivatives, dense elimination, and the general solver."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Marginalisation: the same as solving jointly, and no information where there is none."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

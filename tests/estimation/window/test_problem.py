@@ -1,7 +1,5 @@
 """The normal equations of a window against differences and against a dense elimination."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

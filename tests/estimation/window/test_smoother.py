@@ -1,7 +1,5 @@
 """The smoother end to end on simulated tracks."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Tracks in the window."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.estimation.window.tracks import Observations, Tracks

@@ -1,7 +1,5 @@
 """All that the smoother compiles is compiled ahead."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.estimation.codegen.kernels import residual_kernel, window_kernels

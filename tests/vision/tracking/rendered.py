@@ -1,7 +1,5 @@
 """Cameras in a painted room: images with known depth, for tests of tracking."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Keypoints stay on their points: alignment with the first image, corners in fractions of a pixel."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Rays by splines against the inverted camera model."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The tracker on ten seconds of EuRoC MH_01: life of tracks, and agreement with the true motion."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Keypoints that are tracked already, in the form of the tracker."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

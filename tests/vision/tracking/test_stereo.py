@@ -1,7 +1,5 @@
 """Tracks that several cameras of a rig see, on rendered images."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

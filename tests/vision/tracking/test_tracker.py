@@ -1,7 +1,5 @@
 """The tracker on rendered and warped images of known motion."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Two-point RANSAC: outliers, turns on the spot, wrong and unknown turns."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
