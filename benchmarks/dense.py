@@ -18,19 +18,15 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from maplab_py.algorithms.dense.clouds import CloudMaker
-from maplab_py.algorithms.dense.depth_inputs import DepthViews
-from maplab_py.algorithms.dense.fusion import fuse_depth
+from maplab_py.algorithms.dense import clouds, depth_inputs, fusion, meshing
 from maplab_py.algorithms.dense.grid import GridSettings, TsdfGrid
-from maplab_py.algorithms.dense.meshing import map_mesh
 from maplab_py.algorithms.dense.options import MESH_MIN_WEIGHT, FusionOptions, StereoOptions
 from maplab_py.algorithms.dense.reconstruction import StereoSettings, reconstruct_stereo
 from maplab_py.algorithms.dense.resources import FrameResources
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.array_types import F64
-from maplab_py.geometry import se3
-from maplab_py.geometry.alignment import align_yaw_position
+from maplab_py.geometry import alignment, se3
 from maplab_py.interop.resources.depth_maps import import_depth_maps
 from maplab_py.interop.resources.images import ImageImportOptions, import_images
 from maplab_py.simulation.scenario_file import load_scenario
@@ -100,7 +96,7 @@ def seen_surface(true_depth: VIMap) -> F64:
     for row in np.flatnonzero(resources_of(true_depth, (8,)))[::8].tolist():
         frame = int(true_depth.resources.owner[row])
         depth = resources.depth(row)
-        maker = CloudMaker(resources.camera(frame))
+        maker = clouds.CloudMaker(resources.camera(frame))
         p_C = maker.cloud(np.where(depth < FAR_M, depth, np.float32(0.0))).p[::97]
         points.append(se3.transform(resources.T_G_C(frame), p_C))
     return np.concatenate(points)
@@ -121,7 +117,7 @@ def mesh_errors(room: StereoRoom, p_G: F64, surface: F64) -> MeshErrors:
 
 def measure_integration(true_depth: VIMap, repeats: int = 3) -> dict[str, Integration]:
     """Fuse true depth here and, where it is installed, by Open3D; the best of some runs counts."""
-    views = DepthViews(true_depth, Path(), 8)
+    views = depth_inputs.DepthViews(true_depth, Path(), 8)
     rows = views.of_missions([0])
     depths = [views.view(row) for row in rows.tolist()]
     poses = [se3.to_matrix(T) for T in views.poses(rows, se3.identity())]
@@ -184,7 +180,7 @@ def optimised(room: StereoRoom) -> VIMap:
     """Return the map of the odometry after optvi, aligned with the truth in yaw and position."""
     vi_map = optimize(load_map(room.map_folder)[0], VIOptimizationOptions())[0]
     truth = room.true_map
-    T_truth = align_yaw_position(truth.T_G_I[:, 4:], vi_map.T_G_I[:, 4:])
+    T_truth = alignment.align_yaw_position(truth.T_G_I[:, 4:], vi_map.T_G_I[:, 4:])
     T_G_M = se3.compose(T_truth, vi_map.baseframes.T_G_M)
     return vi_map.replace(baseframes=vi_map.baseframes.replace(T_G_M=T_G_M))
 
@@ -194,8 +190,8 @@ def measure(room: StereoRoom, *, with_optimised: bool = False) -> dict[str, Any]
     truth = room.true_map
     true_depth, _ = import_depth_maps(truth, 0, 0, room.depth())
     surface = seen_surface(true_depth)
-    fused, _ = fuse_depth(true_depth, Path(), None, TRUE_OPTIONS)
-    mesh, _ = map_mesh(fused, Path(), None, SEEN_OF_TRUTH)
+    fused, _ = fusion.fuse_depth(true_depth, Path(), None, TRUE_OPTIONS)
+    mesh, _ = meshing.map_mesh(fused, Path(), None, SEEN_OF_TRUTH)
     results: dict[str, Any] = {"mesh of true depth": mesh_errors(room, mesh.p, surface)}
     links = ImageImportOptions(link=True)
     images, _ = import_images(truth, 0, room.recording, links)
@@ -206,14 +202,14 @@ def measure(room: StereoRoom, *, with_optimised: bool = False) -> dict[str, Any]
         cpu_ms = 1e3 * (time.process_time() - cpu) / report.resources
         fill = report.pairs[0].matched_share
         results[f"depth {name}"] = depth_errors(room, stereo, 336.0 * 0.11, fill, cpu_ms)
-        fused, _ = fuse_depth(stereo, Path(), None, OPTIONS)
-        mesh, _ = map_mesh(fused, Path(), None, MESH_MIN_WEIGHT)
+        fused, _ = fusion.fuse_depth(stereo, Path(), None, OPTIONS)
+        mesh, _ = meshing.map_mesh(fused, Path(), None, MESH_MIN_WEIGHT)
         results[f"mesh {name}"] = mesh_errors(room, mesh.p, surface)
     if with_optimised:
         images, _ = import_images(optimised(room), 0, room.recording, links)
         stereo, _ = reconstruct_stereo(images, Path(), None, StereoSettings())
-        fused, _ = fuse_depth(stereo, Path(), None, OPTIONS)
-        mesh, _ = map_mesh(fused, Path(), None, MESH_MIN_WEIGHT)
+        fused, _ = fusion.fuse_depth(stereo, Path(), None, OPTIONS)
+        mesh, _ = meshing.map_mesh(fused, Path(), None, MESH_MIN_WEIGHT)
         results["mesh with the poses of optvi"] = mesh_errors(room, mesh.p, surface)
     results["integration"] = measure_integration(true_depth)
     return results

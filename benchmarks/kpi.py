@@ -21,12 +21,11 @@ from benchmarks.comparison import compare
 from benchmarks.optvi import measure_tango
 from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
-from tests.support.data import REPOSITORY, shared_data_folder
-from tests.support.programs import module_of_tests
+from tests.support import data, programs
 
 Figures = dict[str, float]
-STORED = REPOSITORY / "docs" / "kpi"
-PAGE = REPOSITORY / "docs" / "benchmarks.md"
+STORED = data.REPOSITORY / "docs" / "kpi"
+PAGE = data.REPOSITORY / "docs" / "benchmarks.md"
 _BEGIN, _END = "<!-- figures over releases -->\n", "<!-- end of figures over releases -->\n"
 _SHOWN_RELEASES = 4
 
@@ -122,7 +121,7 @@ def _tango() -> Figures:
 
 
 def _mh_01() -> Figures:
-    recording = shared_data_folder() / "euroc_mh01_10s"
+    recording = data.shared_data_folder() / "euroc_mh01_10s"
     session = Session(load_registry())
     session.run("rovioli", str(recording))
     truth = recording / "mav0" / "state_groundtruth_estimate0" / "data.csv"
@@ -132,11 +131,11 @@ def _mh_01() -> Figures:
 
 def _v1_01() -> Figures:
     session = Session(load_registry())
-    maps = shared_data_folder() / "maplab_maps" / "euroc_v1_01"
+    maps = data.shared_data_folder() / "maplab_maps" / "euroc_v1_01"
     session.run("load_merge_all_submaps", maps_folder=str(maps))
     for command in ("optvi", "lc", "optvi"):
         session.run(command)
-    truth = shared_data_folder() / "ground_truth" / "V1_01_easy.csv"
+    truth = data.shared_data_folder() / "ground_truth" / "V1_01_easy.csv"
     report: Any = session.run("evaluate_trajectory", ground_truth=str(truth))
     return {"V1_01_map_ate_m": report.ape_m.rmse}
 
@@ -158,7 +157,7 @@ def _one_room() -> Figures:
 
 def _city() -> Figures:
     done = subprocess.run(
-        [*module_of_tests("benchmarks.city"), "10"],
+        [*programs.module_of_tests("benchmarks.city"), "10"],
         capture_output=True,
         text=True,
         check=True,

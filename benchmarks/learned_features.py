@@ -18,16 +18,12 @@ import numpy as np
 from maplab_py.algorithms.landmarks.keypoint_rays import bearings
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.array_types import F32, F64, I8, I64, U8, U64, Mask
-from maplab_py.geometry import se3, so3
-from maplab_py.geometry.interpolation import interpolate_poses
-from maplab_py.geometry.triangulation import triangulate
-from maplab_py.interop.recordings.protocol import FrameSet
-from maplab_py.interop.recordings.reader_choice import open_recording
+from maplab_py.geometry import interpolation, se3, so3, triangulation
+from maplab_py.interop.recordings import protocol, reader_choice
 from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.interop.trajectories import read_trajectory
 from maplab_py.sensors import Camera
-from maplab_py.vision.absolute_pose import PoseProblems, solve_poses
-from maplab_py.vision.descriptors import differences
+from maplab_py.vision import absolute_pose, descriptors
 from maplab_py.vision.epipolar_matching import EpipolarRule, ImageRays, match_images
 from maplab_py.vision.features.extension import ExtractedFeatures
 from maplab_py.vision.features.extractors import KINDS, extract
@@ -79,12 +75,12 @@ def measure(
     With less light than 1 every other keyframe is darker, and its pairs with the others count.
     """
     options = LoopClosureOptions()
-    recording = open_recording(shared_data_folder() / "euroc_v101_keyframes")
+    recording = reader_choice.open_recording(shared_data_folder() / "euroc_v101_keyframes")
     cameras, T_I_C = recording.device.cameras, recording.device.T_I_C
-    sets = [event for event in EventStream(recording) if isinstance(event, FrameSet)]
+    sets = [event for event in EventStream(recording) if isinstance(event, protocol.FrameSet)]
     truth = read_trajectory(shared_data_folder() / "euroc_imu" / "V101.gt.csv")
     times_ns = np.array([each.time_ns for each in sets])
-    T_G_I, known = interpolate_poses(truth.times_ns, truth.T_R_B, times_ns)
+    T_G_I, known = interpolation.interpolate_poses(truth.times_ns, truth.T_R_B, times_ns)
     sets = [each for each, is_known in zip(sets, known.tolist(), strict=True) if is_known]
     T_G_I, times_ns = T_G_I[known], times_ns[known]
     images = [[image.grey() for image in each.images] for each in sets]
@@ -158,7 +154,7 @@ def _keyframe(
     i, j, _ = match_images(left, right, EpipolarRule(2.0, 0.5, largest, 0.95))
     origins = np.tile([left.origin_G, right.origin_G], (len(i), 1))
     rays = np.stack([left.ray_G[i], right.ray_G[j]], axis=1).reshape(-1, 3)
-    point, ok, _ = triangulate(origins, rays, 2 * np.arange(len(i) + 1))
+    point, ok, _ = triangulation.triangulate(origins, rays, 2 * np.arange(len(i) + 1))
     ahead = np.einsum("nd,nd->n", point - left.origin_G, left.ray_G[i]) > 0.0
     points, has_point = np.zeros((len(left.ray_G), 3)), np.zeros(len(left.ray_G), dtype=np.bool_)
     points[i], has_point[i] = point, ok & ahead
@@ -187,7 +183,7 @@ def _verify(
     """Return the inliers (P,) of each pair's pose, and whether that is right (P,)."""
     start = np.cumsum([0, *(len(i) for i, _ in matches)])
     query, place = pairs.T
-    problems = PoseProblems(
+    problems = absolute_pose.PoseProblems(
         start=start,
         key=np.arange(len(pairs)),
         q_M_I=T_G_I[query, :4],
@@ -200,7 +196,7 @@ def _verify(
         tolerance=np.concatenate([options.ransac_pixel_sigma * frames[a].rad_per_px[i]
                                   for a, (i, _) in zip(query, matches, strict=True)]),
     )  # fmt: skip
-    solved = solve_poses(problems, max_iterations=options.num_ransac_iters)
+    solved = absolute_pose.solve_poses(problems, max_iterations=options.num_ransac_iters)
     error = se3.relative(T_G_I[query], solved.T_M_I)
     turn = np.degrees(np.linalg.norm(so3.log(error[:, :4]), axis=1))
     is_right = (np.linalg.norm(error[:, 4:], axis=1) < _RIGHT_M) & (turn < _RIGHT_DEG)
@@ -221,7 +217,7 @@ def _match(query: Keyframe, place: Keyframe) -> tuple[I64, I64, I64]:
     best = np.argmax(product, axis=1)
     i = np.flatnonzero(np.argmax(product, axis=0)[best] == np.arange(len(best)))
     j = rows[best[i]]
-    return i, j, differences(query.words, i, place.words, j).astype(np.int64)
+    return i, j, descriptors.differences(query.words, i, place.words, j).astype(np.int64)
 
 
 def _vectors(words: U64 | I8) -> F32:

@@ -10,9 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from maplab_py.algorithms.image_features.extraction import extract_features
+from maplab_py.algorithms.image_features import extraction, tracks
 from maplab_py.algorithms.image_features.options import ExtractionOptions, FeatureTrackOptions
-from maplab_py.algorithms.image_features.tracks import track_features
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
 from maplab_py.algorithms.landmarks.tracks import init_tracks
 from maplab_py.algorithms.localization.database import (
@@ -26,9 +25,8 @@ from maplab_py.algorithms.summary.options import SummaryMapOptions
 from maplab_py.algorithms.summary.summary import make_summary_map
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.resources.images import import_images
-from maplab_py.simulation.raw_data import write_maps
+from maplab_py.simulation import raw_data, scenario_file
 from maplab_py.simulation.scenario import Scenario, SessionImages
-from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.truth import Truth, true_map
 from maplab_py.storage.native import load_map
 from maplab_py.vimap import VIMap
@@ -41,7 +39,7 @@ _RIGHT_M, _RIGHT_DEG, _WRONG_M, _WRONG_DEG = 0.25, 2.0, 0.5, 5.0
 
 
 def _scenario() -> Scenario:
-    scenario = load_scenario("stereo_room").with_seed(2)
+    scenario = scenario_file.load_scenario("stereo_room").with_seed(2)
     day = dataclasses.replace(scenario.sessions[0], duration_s=14.0, turns=1.0)
     query = dataclasses.replace(day, duration_s=8.0, turns=0.6, start_turn=0.25)
     dusk = dataclasses.replace(
@@ -60,7 +58,7 @@ def _scenario() -> Scenario:
 
 def _described(vi_map: VIMap, features: str) -> VIMap:
     options = ExtractionOptions(feature_type=features, max_features=600)
-    return extract_features(vi_map, Path(), options)[0]
+    return extraction.extract_features(vi_map, Path(), options)[0]
 
 
 def _count(database: LocalizationMap, queries: VIMap) -> str:
@@ -82,7 +80,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     folder = parser.parse_args().folder
     if not folder.exists():
-        write_maps(_scenario(), folder, raw_data=True)
+        raw_data.write_maps(_scenario(), folder, raw_data=True)
     truth = Truth.load(folder / "truth.npz")
     sessions = []
     for name in ("session_1", "session_2", "session_3"):
@@ -90,7 +88,7 @@ def main() -> None:
         sessions.append(without_features(true_map(vi_map, truth)))
     for features in ("xfeat", "sift", "brisk", "orb"):
         day, dusk, night = (_described(session, features) for session in sessions)
-        tracked, _ = track_features(day, FeatureTrackOptions(feature_type=features))
+        tracked, _ = tracks.track_features(day, FeatureTrackOptions(feature_type=features))
         vi_map, _ = init_tracks(tracked, LandmarkQualityOptions())
         feature_type = KINDS[features].feature_type
         summary = make_summary_map(vi_map, SummaryMapOptions(), feature_type=feature_type)

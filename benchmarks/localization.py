@@ -19,10 +19,8 @@ from maplab_py.algorithms.summary.options import SummaryMapOptions
 from maplab_py.algorithms.summary.summary import make_summary_map
 from maplab_py.simulation.scenario import MeasurementOptions, Scenario, SessionOptions, WorldOptions
 from maplab_py.simulation.simulate import simulate
-from maplab_py.vimap import LandmarkQuality, VIMap
-from maplab_py.vimap.merge import merge_maps
-from tests.support.machine import slowness
-from tests.support.noiseless import without_noise
+from maplab_py.vimap import LandmarkQuality, VIMap, merge
+from tests.support import machine, noiseless
 
 LANDMARKS, QUERIES, REPEATS = 30_000, 60, 4
 
@@ -39,13 +37,13 @@ def maps() -> tuple[VIMap, VIMap]:
             SessionOptions(kind="loop", duration_s=20.0, turns=0.4, start_turn=0.2),
         ),
     )
-    scenario = dataclasses.replace(scenario, drift=without_noise(scenario).drift)
+    scenario = dataclasses.replace(scenario, drift=noiseless.without_noise(scenario).drift)
     data = simulate(scenario)
     placed = [
         m.replace(baseframes=m.baseframes.replace(T_G_M=data.truth.T_G_M[row][None]))
         for row, m in enumerate(data.maps)
     ]
-    vi_map = functools.reduce(lambda a, b: merge_maps(a, b)[0], placed[:-1])
+    vi_map = functools.reduce(lambda a, b: merge.merge_maps(a, b)[0], placed[:-1])
     quality = np.full(len(vi_map.landmarks), LandmarkQuality.BAD)
     longest = np.argsort(-np.diff(vi_map.observation_start), kind="stable")
     quality[longest[:LANDMARKS]] = LandmarkQuality.GOOD
@@ -64,10 +62,10 @@ def main() -> None:
         chosen = list(queries(source))[:QUERIES]
         localizer.localize(chosen[0])  # compiles
         for _ in range(REPEATS):
-            factor = slowness()
+            factor = machine.slowness()
             with mock.patch("time.perf_counter", time.process_time):
                 answers = [localizer.localize(query) for query in chosen]
-            factor = 0.5 * (factor + slowness())
+            factor = 0.5 * (factor + machine.slowness())
             share = np.mean([a.outcome is Outcome.LOCALIZED for a in answers])
             keypoints = np.mean([a.keypoints for a in answers])
             print(

@@ -16,8 +16,7 @@ from benchmarks import problems
 from benchmarks.maplab_solver import inertial_parts
 from benchmarks.solution import effort
 from maplab_py.estimation.linear.supernodal_solver import SupernodalCholesky
-from maplab_py.estimation.problem import gauge
-from maplab_py.estimation.problem.iterative import IterativeOptions, IterativeProblem
+from maplab_py.estimation.problem import gauge, iterative
 from maplab_py.estimation.problem.problem import Problem
 from maplab_py.estimation.problem.solver import SolverOptions, optimize_states
 from maplab_py.estimation.problem.submaps import SubmapProblem
@@ -112,8 +111,8 @@ def _solve(made: problems.InertialProblem, forcing: float, submaps: int, iterati
         if submaps:
             problem: Problem = SubmapProblem(states, visual, factors, submaps, tell=print)
         elif forcing:
-            problem = IterativeProblem(
-                states, visual, factors, None, IterativeOptions(forcing=forcing)
+            problem = iterative.IterativeProblem(
+                states, visual, factors, None, iterative.IterativeOptions(forcing=forcing)
             )
         else:
             problem = Problem(states, visual, factors)

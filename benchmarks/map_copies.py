@@ -14,8 +14,7 @@ from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
 from maplab_py.geometry import se3, so3
 from maplab_py.storage.map_loading import load_map
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.merge import merge_maps
+from maplab_py.vimap import VIMap, merge
 from tests.support.data import shared_data
 
 _TANGO = "maplab_maps/tango_handheld"
@@ -26,7 +25,7 @@ def copies(vi_map: VIMap, count: int, seed: int = 0) -> VIMap:
     merged = vi_map
     for copy in range(1, count):
         disturbed = _disturbed(vi_map, np.random.default_rng([seed, copy]))
-        merged, _ = merge_maps(merged, disturbed, assign_new_ids=True)
+        merged, _ = merge.merge_maps(merged, disturbed, assign_new_ids=True)
     return merged
 
 

@@ -15,10 +15,8 @@ from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
-from maplab_py.geometry import se3
-from maplab_py.geometry.alignment import umeyama
-from maplab_py.simulation.evaluation import evaluate_map, shown_points, sightings
-from maplab_py.simulation.scenario_file import load_scenario
+from maplab_py.geometry import alignment, se3
+from maplab_py.simulation import evaluation, scenario_file
 from maplab_py.simulation.simulate import simulate
 from maplab_py.simulation.truth import Truth
 from maplab_py.vimap import IdIndex, LandmarkQuality, VIMap
@@ -66,7 +64,7 @@ class ThinningFigures:
 
 def sessions(scenario: str, seed: int) -> tuple[VIMap, Truth]:
     """Return the sessions of a scenario in one map, and the truth."""
-    data = simulate(load_scenario(scenario).with_seed(seed))
+    data = simulate(scenario_file.load_scenario(scenario).with_seed(seed))
     return joined(data), data.truth
 
 
@@ -81,10 +79,10 @@ def merged(vi_map: VIMap, *, keyframed: bool) -> VIMap:
 
 def workflow_figures(vi_map: VIMap, truth: Truth, seed: int) -> WorkflowFigures:
     """Compare a map with the truth."""
-    errors = evaluate_map(vi_map, truth)
-    shown = shown_points(sightings(vi_map, truth), len(vi_map.landmarks))
+    errors = evaluation.evaluate_map(vi_map, truth)
+    shown = evaluation.shown_points(evaluation.sightings(vi_map, truth), len(vi_map.landmarks))
     row = IdIndex(truth.vertex_id).rows(vi_map.vertices.id)
-    aligned, _ = umeyama(truth.T_G_I[row, 4:], vi_map.T_G_I[:, 4:])
+    aligned, _ = alignment.umeyama(truth.T_G_I[row, 4:], vi_map.T_G_I[:, 4:])
     known = np.flatnonzero(shown >= 0)
     offset = se3.transform(aligned, vi_map.p_G[known]) - truth.point_G[shown[known]]
     error = np.linalg.norm(offset, axis=1)
@@ -117,7 +115,7 @@ def thinning_figures(vi_map: VIMap, truth: Truth) -> Iterator[ThinningFigures]:
         begin = time.process_time()
         result, report = optimize(vi_map, options)
         seconds = time.process_time() - begin
-        errors = evaluate_map(result, truth)
+        errors = evaluation.evaluate_map(result, truth)
         yield ThinningFigures(
             per_landmark, covisible, report.observations, report.observations_over_limit,
             report.observations_not_covisible, seconds, report.iterations, report.linear_solver,

@@ -14,11 +14,9 @@ from benchmarks.problems import (
 )
 from benchmarks.solution import Effort, Solution, StoppingRule, effort
 from maplab_py.estimation.codegen.kernels import residual_kernel, visual_kernels
-from maplab_py.estimation.imu.inertial_data import InertialData
-from maplab_py.estimation.imu.preintegration import integrate
+from maplab_py.estimation.imu import inertial_data, preintegration
 from maplab_py.estimation.loss import Loss
-from maplab_py.estimation.problem import gauge
-from maplab_py.estimation.problem.iterative import IterativeOptions, IterativeProblem
+from maplab_py.estimation.problem import gauge, iterative
 from maplab_py.estimation.problem.problem import Problem
 from maplab_py.estimation.problem.solver import SolverOptions, optimize_states
 from maplab_py.estimation.states import States
@@ -80,8 +78,8 @@ def _solve(
     states: States, visual: VisualTerms, factors: list[FactorTerm], rule: StoppingRule
 ) -> Solution:
     if rule.forcing:
-        forcing = IterativeOptions(forcing=rule.forcing)
-        problem: Problem = IterativeProblem(states, visual, factors, None, forcing)
+        forcing = iterative.IterativeOptions(forcing=rule.forcing)
+        problem: Problem = iterative.IterativeProblem(states, visual, factors, None, forcing)
     else:
         problem = Problem(states, visual, factors)
     gauge.fix_pose(problem, np.arange(NUM_KNOWN_POSES))
@@ -122,7 +120,7 @@ def _visual_terms(problem: VisualProblem, observed: Observations) -> VisualTerms
     return VisualTerms(kernels, observed, cameras, len(problem.T_G_I), loss=Loss.NONE)
 
 
-def _inertial_data(problem: InertialProblem) -> InertialData:
+def _inertial_data(problem: InertialProblem) -> inertial_data.InertialData:
     edges, samples = problem.timestamp_ns.shape
     noise = problem.noise
     imu = Imu(
@@ -132,7 +130,7 @@ def _inertial_data(problem: InertialProblem) -> InertialData:
         acc_noise_density=noise.accel,
         acc_bias_random_walk_noise_density=noise.accel_walk,
     )
-    return InertialData(
+    return inertial_data.InertialData(
         sample_start=np.arange(edges + 1) * samples,
         timestamp_ns=problem.timestamp_ns.reshape(-1),
         accel_gyro=problem.accel_gyro.reshape(-1, 6),
@@ -141,10 +139,10 @@ def _inertial_data(problem: InertialProblem) -> InertialData:
     )
 
 
-def _inertial_terms(data: InertialData, first: I64) -> list[FactorTerm]:
+def _inertial_terms(data: inertial_data.InertialData, first: I64) -> list[FactorTerm]:
     kernel = residual_kernel("inertial", inertial)
     gravity = np.tile([0.0, 0.0, -GRAVITY_MPS2], (len(data), 1))
-    walk = integrate(data, np.zeros(3), np.zeros(3))
+    walk = preintegration.integrate(data, np.zeros(3), np.zeros(3))
     return [
         InertialTerm(kernel, data, first, first + 1, gravity),
         BiasWalkTerm(first, first + 1, walk.gyro_walk_variance, walk.accel_walk_variance),

@@ -15,11 +15,10 @@ import numpy as np
 
 from maplab_py.array_types import F64
 from maplab_py.geometry import se3
-from maplab_py.simulation.imaging import pixel_rays
+from maplab_py.simulation import imaging, scenario_file
 from maplab_py.simulation.raw_data import SessionFolders, write_images
 from maplab_py.simulation.ray_caster import RayCaster, painted_boxes
 from maplab_py.simulation.scenario import Scenario
-from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.scene import Scene, make_scene
 from maplab_py.simulation.simulate import RecordedSession, simulate
 from tests.simulation.slow_renderer import render_slowly
@@ -54,7 +53,7 @@ def measure(
     name: str = "stereo_room", images: int = 20, boxes: int = 0, compared: int = COMPARED
 ) -> Figures:
     """Render images of a scenario, with some more boxes in its room, and `compared` of them slowly."""
-    scenario = load_scenario(name)
+    scenario = scenario_file.load_scenario(name)
     short = dataclasses.replace(scenario.sessions[0], phases=(), duration_s=images / 10.0)
     scenario = dataclasses.replace(
         scenario,
@@ -74,7 +73,7 @@ def measure(
 
 def _measured(scenario: Scenario, session: RecordedSession, scene: Scene, compared: int) -> Figures:
     camera = session.device.true_rig.cameras[0]
-    rays, focal_px = pixel_rays(camera), float(np.mean(camera.intrinsics[-4:-2]))
+    rays, focal_px = imaging.pixel_rays(camera), float(np.mean(camera.intrinsics[-4:-2]))
     caster = RayCaster.of(painted_boxes(scene), rays, focal_px)
     T_I_C, recording = session.device.true_rig.T_B_C[0], session.recording
     poses: F64 = se3.compose(recording.spline.evaluate(recording.frame_s).T_G_I, T_I_C)[:, None]

@@ -10,9 +10,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.sparsification import selection
+from maplab_py.algorithms.sparsification import selection, sparsify
 from maplab_py.algorithms.sparsification.selection import CoverageProblem, solve_relaxed
-from maplab_py.algorithms.sparsification.sparsify import solve_by_parts
 from tests.algorithms.sparsification.instances import corridor
 from tests.support.machine import slowness
 
@@ -54,7 +53,7 @@ def choices(landmarks: int) -> dict[str, Callable[[CoverageProblem], tuple[Mask,
         return solution.chosen, solution.bound
 
     def by_parts(problem: CoverageProblem) -> tuple[Mask, float]:
-        return solve_by_parts(problem, landmarks // 4)[0].chosen, float("nan")
+        return sparsify.solve_by_parts(problem, landmarks // 4)[0].chosen, float("nan")
 
     def plain(choose: Callable[[CoverageProblem], Mask]) -> Callable[..., tuple[Mask, float]]:
         return lambda problem: (choose(problem), float("nan"))

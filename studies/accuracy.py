@@ -11,8 +11,7 @@ import numpy as np
 from maplab_py.algorithms.self_calibration.calibration import Calibration, calibrate
 from maplab_py.algorithms.self_calibration.device import transfer_calibration
 from maplab_py.algorithms.self_calibration.reports import SelfCalibrationReport
-from maplab_py.algorithms.self_calibration.segments import selection
-from maplab_py.algorithms.self_calibration.segments.splitting import extract_submap
+from maplab_py.algorithms.self_calibration.segments import selection, splitting
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.array_types import F64
@@ -132,7 +131,7 @@ def _segments(scenario: Scenario, data: DataSet, method: str, per_group: int) ->
         rows = select_by_gain(data.vi_map, OPTIONS, max_segments=FEW)
     else:
         rows = chosen_segments(data.evaluation, method, data.number, per_group)
-    return extract_submap(data.vi_map, np.unique(np.concatenate(rows))), len(rows)
+    return splitting.extract_submap(data.vi_map, np.unique(np.concatenate(rows))), len(rows)
 
 
 def _measured(

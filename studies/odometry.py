@@ -14,8 +14,7 @@ from maplab_py.algorithms.self_calibration.device import transfer_calibration
 from maplab_py.algorithms.self_calibration.estimation.problem import SegmentProblem
 from maplab_py.algorithms.vi_optimization.solution import with_estimated_sensors
 from maplab_py.array_types import F64
-from maplab_py.geometry import se3
-from maplab_py.geometry.alignment import align_yaw_position
+from maplab_py.geometry import alignment, se3
 from maplab_py.research.joint_ekf import filter_jointly
 from maplab_py.sensors import SensorSet
 from maplab_py.simulation.scenario import Scenario
@@ -79,5 +78,5 @@ def _odometry_error_m(session: SimulatedData, sensors: SensorSet) -> float:
     p_G = filter_jointly(vi_map, _FIXED).T_G_I[:, 4:]
     row = IdIndex(session.truth.vertex_id).rows(vi_map.vertices.id)
     p_true = session.truth.T_G_I[row, 4:]
-    aligned = se3.transform(align_yaw_position(p_true, p_G), p_G)
+    aligned = se3.transform(alignment.align_yaw_position(p_true, p_G), p_G)
     return float(np.sqrt(np.mean(np.sum((aligned - p_true) ** 2, axis=1))))

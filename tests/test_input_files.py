@@ -21,8 +21,7 @@ from maplab_py.console.scripts.aliases import read_aliases
 from maplab_py.console.scripts.batch import read_batch, read_script
 from maplab_py.errors import MapError, UserError
 from maplab_py.input_files import TooLarge, inflate, inflated_size, read_bytes, read_npz
-from maplab_py.interop.external_closures import read_external_closures
-from maplab_py.interop.ply import parse_ply
+from maplab_py.interop import external_closures, ply
 from maplab_py.output_files import check_writable, planning, staging, write_bytes, write_text
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.storage.extension_fields import PACKED, with_extension
@@ -137,7 +136,7 @@ def test_a_damaged_record_of_closures_is_told(tmp_path: Path, plain: bytes) -> N
     [
         read_batch,
         load_scenario,
-        lambda path: read_external_closures(walk_map(), path),
+        lambda path: external_closures.read_external_closures(walk_map(), path),
     ],
 )
 def test_alias_bombs_are_refused(tmp_path: Path, read: Callable[[Path], object]) -> None:
@@ -171,7 +170,7 @@ def test_files_that_people_write_are_bounded(
 def test_ply_files_are_bounded(header: str, said: str) -> None:
     text = f"ply\nformat binary_little_endian 1.0\n{header}\nend_header\n"
     with pytest.raises(MapError, match=said):
-        parse_ply(text.encode(), "a.ply")
+        ply.parse_ply(text.encode(), "a.ply")
 
 
 def test_text_is_written_as_it_is_given(tmp_path: Path) -> None:

@@ -12,8 +12,7 @@ from maplab_py import memory
 from maplab_py.console.commands.command import describe
 from maplab_py.console.commands.registry import Plugin, load_registry
 from maplab_py.console.scripts.runner import Runner
-from maplab_py.console.session.session import Session
-from maplab_py.console.session.status import Status
+from maplab_py.console.session import session, status
 from maplab_py.console.terminal.output import ConsoleTerminal
 from maplab_py.estimation.linear.block_cholesky import BlockCholesky
 from maplab_py.memory import NotEnoughMemory, available_bytes, memory_limited, require_memory
@@ -89,16 +88,16 @@ LINES = ("optvi", "lc", "relax", "lsparsify --num_landmarks_to_keep=3000")
 @pytest.mark.parametrize("line", LINES)
 def test_commands_refuse_in_one_line(capsys: Capture, line: str) -> None:
     terminal = ConsoleTerminal()
-    runner = Runner(Session(load_registry(), terminal), terminal)
-    assert runner.run_text(f"load {shared_data('maplab_maps/tango_handheld')}") == Status.OK
+    runner = Runner(session.Session(load_registry(), terminal), terminal)
+    assert runner.run_text(f"load {shared_data('maplab_maps/tango_handheld')}") == status.Status.OK
     before = runner.session.maps.state
     capsys.readouterr()
-    assert runner.run_text(f"{line} --max_memory_gb=0.01") == Status.USER_ERROR
+    assert runner.run_text(f"{line} --max_memory_gb=0.01") == status.Status.USER_ERROR
     _, err = capsys.readouterr()
     (message,) = err.splitlines()
     assert "0.01 GB are allowed by --max_memory_gb" in message
     assert runner.session.maps.state is before
-    assert runner.run_text(f"{line} --max_memory_gb=much") == Status.USER_ERROR
+    assert runner.run_text(f"{line} --max_memory_gb=much") == status.Status.USER_ERROR
     assert "must be a number of gigabytes" in capsys.readouterr().err
 
 
@@ -112,9 +111,9 @@ def test_running_out_of_memory_is_no_error_of_the_program(
         return Message(str(np.empty(2**60, dtype=np.uint8)[0]))
 
     terminal = ConsoleTerminal()
-    runner = Runner(Session(load_registry(), terminal), terminal)
+    runner = Runner(session.Session(load_registry(), terminal), terminal)
     runner.session.registry.add(describe(greedy, "greedy", (), needs_map=False), Plugin("greedy"))
-    assert runner.run_text("greedy") == Status.FAILED
+    assert runner.run_text("greedy") == status.Status.FAILED
     (line,) = capsys.readouterr().err.splitlines()
     assert "there is not enough memory" in line
     assert "an error of the program" not in line
@@ -139,7 +138,7 @@ def test_a_map_that_does_not_fit_is_refused(tmp_path: Path) -> None:
         check=False,
         cwd=tmp_path,
     )
-    assert done.returncode == Status.USER_ERROR
+    assert done.returncode == status.Status.USER_ERROR
     (line,) = [each for each in done.stderr.splitlines() if each.startswith("error")]
     assert f"{folder}: does not fit into memory" in line
     assert "an error of the program" not in line

@@ -20,8 +20,7 @@ from maplab_py.console.commands.lines import split_commands
 from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.scripts.batch import read_stages
 from maplab_py.console.session.session import Session
-from maplab_py.geometry import se3
-from maplab_py.geometry.alignment import umeyama
+from maplab_py.geometry import alignment, se3
 from maplab_py.pipeline.plan import MAP_TEMPLATE, RESULT_TEMPLATE, Stage
 from maplab_py.report import Report
 from maplab_py.sensors.yaml_text import parse_yaml
@@ -74,7 +73,7 @@ def against_truth(vi_map: VIMap, truth: Truth) -> dict[str, Any]:
     mine = known[vi_map.vertices.mission]
     row = IdIndex(truth.vertex_id).rows(vi_map.vertices.id)
     p_true, p_G = truth.T_G_I[row, 4:][mine], vi_map.T_G_I[mine, 4:]
-    apart = p_true - se3.transform(umeyama(p_true, p_G)[0], p_G)
+    apart = p_true - se3.transform(alignment.umeyama(p_true, p_G)[0], p_G)
     accepted, wrong = wrong_closures(vi_map, truth)
     merges, wrong_tracks = wrong_merges(vi_map, truth)
     return {

@@ -12,9 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
+from maplab_py.simulation import scenario_file, simulate
 from maplab_py.simulation.scenario import Scenario, SessionOptions
-from maplab_py.simulation.scenario_file import load_scenario
-from maplab_py.simulation.simulate import SessionSimulator
 from maplab_py.simulation.truth import Truth
 from maplab_py.storage.native import save_map
 
@@ -31,7 +30,7 @@ _PLASTIC = 1.32471795724474602596
 
 def city_scenario(missions: int, *, seed: int = 1, duration_s: float = DURATION_S) -> Scenario:
     """Return the scenario of a number of missions, about 100 observations in each image."""
-    base = load_scenario("city").with_seed(seed)
+    base = scenario_file.load_scenario("city").with_seed(seed)
     side = max(3, round(np.sqrt(missions)))
     world = dataclasses.replace(
         base.world, blocks=(side, side), landmarks_per_room=LANDMARKS_PER_BLOCK
@@ -78,7 +77,7 @@ def read_truth(folder: Path, count: int) -> Truth:
 
 
 def _write(scenario: Scenario, folder: Path, numbers: list[int]) -> None:
-    simulator = SessionSimulator(scenario)
+    simulator = simulate.SessionSimulator(scenario)
     for number in numbers:
         session = simulator.session(number)
         save_map(session.vi_map, _map_folder(folder, number), overwrite=True)

@@ -8,9 +8,7 @@ from maplab_py.console.session.session import Session
 from maplab_py.server.merging import Merger
 from maplab_py.server.options import IncrementalOptions, MergingOptions
 from maplab_py.storage.native import load_map
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.edits import with_new_ids
-from maplab_py.vimap.excerpts import cut_by_time
+from maplab_py.vimap import VIMap, edits, excerpts
 from tests.support.data import shared_data
 from tests.support.submaps import append_submaps
 
@@ -41,8 +39,8 @@ def submaps() -> list[VIMap]:
 def of_two_robots() -> list[VIMap]:
     """Return them as two robots send them by turns: the second half has ids of its own."""
     every = submaps()
-    second = with_new_ids(append_submaps(every[SUBMAPS // 2 :])[0])
-    halves = zip(every[: SUBMAPS // 2], cut_by_time(second, _SUBMAP_S), strict=True)
+    second = edits.with_new_ids(append_submaps(every[SUBMAPS // 2 :])[0])
+    halves = zip(every[: SUBMAPS // 2], excerpts.cut_by_time(second, _SUBMAP_S), strict=True)
     return [submap for pair in halves for submap in pair]
 
 

@@ -21,8 +21,7 @@ import numpy as np
 
 from maplab_py.console.commands.registry import load_registry
 from maplab_py.console.session.session import Session
-from maplab_py.server.journal import read_journal
-from maplab_py.server.spool import Spool, push
+from maplab_py.server import journal, spool
 from maplab_py.simulation.evaluation import evaluate_map
 from maplab_py.simulation.scenario import MeasurementOptions, Scenario, SessionOptions, WorldOptions
 from maplab_py.simulation.simulate import SimulatedData, simulate
@@ -121,7 +120,7 @@ class _Run:
     """One server after the other on one spool."""
 
     def __init__(self, folder: Path, data: SimulatedData, rng: random.Random) -> None:
-        self.spool, self.map_folder = Spool(folder / "spool"), folder / "city"
+        self.spool, self.map_folder = spool.Spool(folder / "spool"), folder / "city"
         self.kills = 0
         self.waits_s: dict[str, float] = {}
         self._rng = rng
@@ -176,11 +175,11 @@ class _Run:
         """Push the next submap when few are waiting."""
         if self._queue and len(self._dropped_s) - len(self.waits_s) < 3:
             robot, path = self._queue.pop(0)
-            push(self.spool, robot, path)
+            spool.push(self.spool, robot, path)
             self._dropped_s[f"{robot}/{path.name}"] = self._serving_s
 
     def _look(self) -> None:
-        for submap in read_journal(self.spool.journal).merged:
+        for submap in journal.read_journal(self.spool.journal).merged:
             if submap.title not in self.waits_s:
                 self.waits_s[submap.title] = self._serving_s - self._dropped_s[submap.title]
 

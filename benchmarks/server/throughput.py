@@ -16,17 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from maplab_py.geometry import se3
-from maplab_py.geometry.alignment import umeyama
+from maplab_py.geometry import alignment, se3
 from maplab_py.geometry.interpolation import interpolate_poses
 from maplab_py.interop.trajectories import Trajectory, read_trajectory
-from maplab_py.server.merging import Merger
+from maplab_py.server import merging, preparation, publishing, server, spool, submap_sources
 from maplab_py.server.options import IncrementalOptions, MapServerOptions, ServiceOptions
-from maplab_py.server.preparation import Intake
-from maplab_py.server.publishing import Publisher
-from maplab_py.server.server import MapServer
-from maplab_py.server.spool import Spool, push
-from maplab_py.server.submap_sources import recorded_sessions, timed_submaps
 from maplab_py.simulation.scenario import MeasurementOptions, Scenario, SessionOptions, WorldOptions
 from maplab_py.simulation.simulate import simulate
 from maplab_py.simulation.truth import Truth
@@ -89,10 +83,10 @@ def measure_throughput(maps_folder: Path | None = None, submap_s: float = 5.0) -
             sessions: dict[str, Any] = {f"robot_{n}": m for n, m in enumerate(data.maps)}
             truth = {f"robot_{n}": _of_session(data.truth, n) for n in range(len(data.maps))}
         else:
-            sessions = dict(recorded_sessions(maps_folder))
+            sessions = dict(submap_sources.recorded_sessions(maps_folder))
             truth = {r: read_trajectory(maps_folder / f"{r}.csv") for r in sessions}
         queue = []
-        for submap in timed_submaps(sessions, submap_s):
+        for submap in submap_sources.timed_submaps(sessions, submap_s):
             path = folder / submap.robot / submap.name
             save_map(submap.vi_map, path, resource_files=submap.resource_files)
             queue.append((submap.robot, path))
@@ -112,7 +106,7 @@ def joint_ate_m(vi_map: VIMap, truth: dict[str, Trajectory]) -> float:
             true.append(poses[:, 4:])
             estimated.append(vi_map.T_G_I[of_mission, 4:])
     p_R, p_G = np.concatenate(true), np.concatenate(estimated)
-    T_R_G, _ = umeyama(p_R, p_G)
+    T_R_G, _ = alignment.umeyama(p_R, p_G)
     return float(np.sqrt(np.mean(np.sum((p_R - se3.transform(T_R_G, p_G)) ** 2, axis=1))))
 
 
@@ -125,8 +119,8 @@ class _Run:
     """Pushes a submap whenever the one before is published, and notes what it took."""
 
     def __init__(self, folder: Path, queue: list[tuple[str, Path]]) -> None:
-        self.spool = Spool(folder / "spool")
-        self.server = MapServer(
+        self.spool = spool.Spool(folder / "spool")
+        self.server = server.MapServer(
             self.spool,
             MapServerOptions(merged_map_folder=str(folder / "map"), backup_interval_s=0),
             incremental=IncrementalOptions(full_optimization_every_nth=0),
@@ -142,10 +136,10 @@ class _Run:
     def figures(self) -> list[ThroughputFigures]:
         """Run the server to its end."""
         timed = [
-            (Intake, "advance", "receive"),
-            (Intake, "_prepared", "load"),
-            (Publisher, "publish", "publish"),
-            (Merger, "optimize_jointly", "joint"),
+            (preparation.Intake, "advance", "receive"),
+            (preparation.Intake, "_prepared", "load"),
+            (publishing.Publisher, "publish", "publish"),
+            (merging.Merger, "optimize_jointly", "joint"),
         ]
         originals = [(owner, name, getattr(owner, name)) for owner, name, _ in timed]
         for owner, name, stage in timed:
@@ -187,7 +181,7 @@ class _Run:
         self._published = self.server.published
         if not self._queue:
             return True
-        push(self.spool, *self._queue.pop(0))
+        spool.push(self.spool, *self._queue.pop(0))
         self._now = {}
         self._begin_s = _processor_s()
         return False

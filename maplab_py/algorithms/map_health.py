@@ -12,12 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from maplab_py.algorithms.landmarks import quality, sightings
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
-from maplab_py.algorithms.landmarks.quality import causes_in_words, evaluate_quality
-from maplab_py.algorithms.landmarks.sightings import residuals
-from maplab_py.algorithms.loop_closure import closure_record
+from maplab_py.algorithms.loop_closure import closure_record, listing
 from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
-from maplab_py.algorithms.loop_closure.listing import list_closures
 from maplab_py.algorithms.loop_closure.reports import Verdict as ClosureVerdict
 from maplab_py.algorithms.recording_check.doctor import map_findings
 from maplab_py.algorithms.recording_check.findings import Finding, Verdict, cause, ok, unknown
@@ -26,9 +24,7 @@ from maplab_py.array_types import F64
 from maplab_py.estimation.imu.inertial_data import InertialData
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report, counted
-from maplab_py.vimap import LandmarkQuality, VIMap
-from maplab_py.vimap.consistency import check_consistency
-from maplab_py.vimap.queries import mission_distances_m, mission_labels
+from maplab_py.vimap import LandmarkQuality, VIMap, consistency, queries
 
 _LIGHTS = {
     Verdict.OK: "green",
@@ -156,7 +152,7 @@ def _graded(
 
 
 def _consistency(vi_map: VIMap) -> Iterator[Finding]:
-    report = check_consistency(vi_map)
+    report = consistency.check_consistency(vi_map)
     rules = counted(len(report.errors), "violated rule")
     if report.errors:
         first = report.errors[0].rule
@@ -180,7 +176,7 @@ def _calibration(vi_map: VIMap) -> Iterator[Finding]:
 
 def _scale(vi_map: VIMap) -> Iterator[Finding]:
     scales = mission_scales(vi_map)
-    labels = mission_labels(vi_map)
+    labels = queries.mission_labels(vi_map)
     for scale in scales:
         observed, expected = f"{scale.scale:.3f} of the IMU's lengths", "0.9 to 1.1"
         name = f"metric scale of {labels[scale.mission]}"
@@ -233,11 +229,11 @@ def _landmarks(vi_map: VIMap, progress: Progress) -> Iterator[Finding]:
     if not len(vi_map.landmarks):
         yield unknown("landmarks", "the map has none", "landmarks")
         return
-    judged, report = evaluate_quality(vi_map, LandmarkQualityOptions(), progress=progress)
+    judged, report = quality.evaluate_quality(vi_map, LandmarkQualityOptions(), progress=progress)
     share = report.bad / max(report.landmarks, 1)
     yield _graded(
         "bad landmarks", share, _BAD_SHARE,
-        f"{100.0 * share:.0f} %, most {causes_in_words(report)[0]}" if report.bad else "none",
+        f"{100.0 * share:.0f} %, most {quality.causes_in_words(report)[0]}" if report.bad else "none",
         f"{100.0 * _BAD_SHARE[0]:.0f} %", "remove_bad_landmarks; why LANDMARK explains one",
     )  # fmt: skip
     keypoints = judged.observations
@@ -245,7 +241,7 @@ def _landmarks(vi_map: VIMap, progress: Progress) -> Iterator[Finding]:
     is_good = judged.landmarks.quality[landmark] == LandmarkQuality.GOOD
     keypoints, landmark = keypoints[is_good], landmark[is_good]
     if len(keypoints):
-        error = residuals(judged, keypoints, judged.p_G[landmark]).error_px
+        error = sightings.residuals(judged, keypoints, judged.p_G[landmark]).error_px
         median = float(np.median(error))
         yield _graded(
             "reprojection error", median, _ERROR_PX, f"{median:.2f} px at the median",
@@ -278,7 +274,7 @@ def _closures(vi_map: VIMap) -> Iterator[Finding]:
             f"{100.0 * drift:.2f} % of the path at the median of {counted(int(is_loop.sum()), 'loop')}",
             f"{100.0 * _DRIFT[0]:g} %", "self_calibrate, or check_recording of the recording",
         )  # fmt: skip
-    gap_m = list_closures(vi_map).largest_gap_m
+    gap_m = listing.list_closures(vi_map).largest_gap_m
     yield _graded(
         "gaps at closures", gap_m, _GAP_M, f"at most {gap_m:.2f} m are left", f"{_GAP_M[0]:g} m",
         "relax, then lc (lc_report --sort_by=gap lists them)",
@@ -315,7 +311,7 @@ def _disk(vi_map: VIMap, folder: Path | None) -> Iterator[Finding]:
         return
     free_gb = 1e-9 * shutil.disk_usage(folder).free
     size_gb = 1e-9 * sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-    path_m = float(mission_distances_m(vi_map).sum())
+    path_m = float(queries.mission_distances_m(vi_map).sum())
     rate = f", {1e3 * size_gb / path_m:.2g} MB per metre" if path_m > 1.0 else ""
     yield _graded(
         "disk", 2.0 * max(size_gb, needed_gb), (free_gb, free_gb),

@@ -12,10 +12,9 @@ import yaml
 from maplab_py.array_types import F64, NDArray
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
-from maplab_py.sensors import Camera, Distortion, Imu, Projection, SensorSet
+from maplab_py.sensors import Camera, Distortion, Imu, Projection, SensorSet, sensors_yaml
 from maplab_py.sensors.camera import DISTORTION_NAMES, MIRROR_NAMES
 from maplab_py.sensors.imu import ImuIntrinsics
-from maplab_py.sensors.sensors_yaml import write_sensors
 
 
 def exported(
@@ -38,7 +37,7 @@ def exported(
     cameras = sensors.camera_rig(rig_id).cameras
     T_I_C = sensors.T_I_C(imu_id, rig_id)
     if form == "maplab":
-        return {"sensors.yaml": write_sensors(sensors)}
+        return {"sensors.yaml": sensors_yaml.write_sensors(sensors)}
     if form == "kalibr":
         return _kalibr(imu, cameras, T_I_C, imu_rate_hz)
     if form == "openvins":

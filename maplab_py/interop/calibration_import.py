@@ -14,15 +14,13 @@ import numpy as np
 from maplab_py.array_types import F64
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
-from maplab_py.interop.calibrations import euroc, single_cameras
-from maplab_py.interop.calibrations.basalt import read_basalt
+from maplab_py.interop.calibrations import basalt, euroc, orb_slam, realsense, single_cameras, vins
 from maplab_py.interop.calibrations.kalibr import (
     is_camera_chain,
     read_camera_chain,
     read_kalibr_imu,
 )
 from maplab_py.interop.calibrations.okvis import is_okvis, is_svo, read_okvis, read_svo
-from maplab_py.interop.calibrations.orb_slam import is_orb_slam, read_orb_slam
 from maplab_py.interop.calibrations.parts import (
     Parts,
     is_json,
@@ -31,12 +29,9 @@ from maplab_py.interop.calibrations.parts import (
     read_json_entry,
     with_imu,
 )
-from maplab_py.interop.calibrations.realsense import is_realsense, read_realsense
-from maplab_py.interop.calibrations.vins import is_vins, read_vins
 from maplab_py.interop.colmap.reading import is_colmap, read_cameras
 from maplab_py.interop.device import DeviceOptions, RecordedSensors, make_device
-from maplab_py.sensors import Camera, CameraRig, Extrinsics, Imu, SensorSet
-from maplab_py.sensors.sensor_set import Sensor
+from maplab_py.sensors import Camera, CameraRig, Extrinsics, Imu, SensorSet, sensor_set
 from maplab_py.sensors.sensors_yaml import note_unread_keys, sensors_of
 from maplab_py.sensors.yaml_entry import Entry
 
@@ -245,7 +240,7 @@ def _joined_of_maplab(
     imu = imus.imu(_of_kind(imus, Imu, chosen.imu_sensor_id, f"{imu_file}: IMUs", "imu"))
     if imu.id in rigs.sensors:
         raise MapError(f"{imu_file}: id {imu.id} is also that of the cameras in {path}")
-    both: dict[str, Sensor] = {imu.id: imu, rig.id: rig}
+    both: dict[str, sensor_set.Sensor] = {imu.id: imu, rig.id: rig}
     T_I_B = {imu.id: se3.identity(), rig.id: rigs.T_B_S(rig.id)}
     mounts = {sensor_id: Extrinsics(imu.id, pose) for sensor_id, pose in T_I_B.items()}
     sensors = SensorSet(both, mounts, {**imus.extra, **rigs.extra})
@@ -341,8 +336,8 @@ def _read(path: Path) -> Parts | SensorSet:
         return _read_openvins(entry, path.parent)
     if is_camera_chain(entry) and "cam0" in entry and "intrinsics" not in entry.child("cam0"):
         return single_cameras.read_dm_vio(entry, path)
-    if is_vins(entry):
-        return read_vins(entry, path.parent)
+    if vins.is_vins(entry):
+        return vins.read_vins(entry, path.parent)
     for is_format, read in _FORMATS:
         if is_format(entry):
             return read(entry)
@@ -366,9 +361,9 @@ def _refuse_other_texts(path: Path) -> None:
 def _read_json(path: Path) -> Parts:
     entry = read_json_entry(path)
     if "value0" in entry or "T_imu_cam" in entry:
-        return read_basalt(entry)
-    if is_realsense(entry):
-        return read_realsense(entry)
+        return basalt.read_basalt(entry)
+    if realsense.is_realsense(entry):
+        return realsense.read_realsense(entry)
     for key, program in _REFUSED_JSON.items():
         if key in entry:
             raise UserError(f"{path}: calibrations of {program} are not read: {KNOWN_FORMATS}")
@@ -438,7 +433,7 @@ _FORMATS: tuple[tuple[Callable[[Entry], bool], Callable[[Entry], Parts]], ...] =
     (lambda entry: _has_imu_noise(entry) and "T_BS" in entry, euroc.read_imu_file),
     (lambda entry: _has_imu_noise(entry) or "imu0" in entry, read_kalibr_imu),
     (lambda entry: "T_BS" in entry, euroc.read_camera_file),
-    (is_orb_slam, read_orb_slam),
+    (orb_slam.is_orb_slam, orb_slam.read_orb_slam),
     (is_okvis, read_okvis),
     (is_svo, read_svo),
     (single_cameras.is_camera_info, single_cameras.read_camera_info),

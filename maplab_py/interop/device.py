@@ -13,8 +13,7 @@ from maplab_py.array_types import F64
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
 from maplab_py.options import Options
-from maplab_py.sensors import Camera, CameraRig, Extrinsics, Imu, SensorSet
-from maplab_py.sensors.sensor_set import Sensor
+from maplab_py.sensors import Camera, CameraRig, Extrinsics, Imu, SensorSet, sensor_set
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -97,7 +96,7 @@ def make_device(
         imu: IMU without id.
         notes: For the user.
     """
-    sensors: dict[str, Sensor] = {}
+    sensors: dict[str, sensor_set.Sensor] = {}
     rig_id, imu_id = "", ""
     if imu is not None:
         imu_id = _imu_id(imu)

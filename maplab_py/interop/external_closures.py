@@ -17,8 +17,7 @@ from maplab_py.geometry import se3, so3
 from maplab_py.input_files import LARGEST, read_text
 from maplab_py.report import counted
 from maplab_py.sensors.yaml_text import parse_yaml
-from maplab_py.vimap import LoopClosureEdges, VIMap, random_ids
-from maplab_py.vimap.edits import content_rng
+from maplab_py.vimap import LoopClosureEdges, VIMap, edits, random_ids
 
 _MAX_TIME_NS = 20_000_000
 """Maximum time between an entry and a vertex, as in maplab; other entries are skipped."""
@@ -65,7 +64,7 @@ def read_external_closures(vi_map: VIMap, path: Path) -> tuple[LoopClosureEdges,
     T_A_B = se3.compose(se3.compose(T_V_S[:, 0], T_S_T[rows]), se3.inverse(T_V_S[:, 1]))
     edges = LoopClosureEdges.filled(
         len(rows),
-        id=random_ids(len(rows), content_rng(vi_map, "external loop closures")),
+        id=random_ids(len(rows), edits.content_rng(vi_map, "external loop closures")),
         from_vertex=vertex[rows, 0],
         to_vertex=vertex[rows, 1],
         T_A_B=T_A_B,

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.errors import MapError
-from maplab_py.interop.stamps import IMU
-from maplab_py.interop.text_table import TextTable, format_rows, read_text_table
+from maplab_py.interop import stamps, text_table
 from maplab_py.output_files import write_text
 
 _HEADER = (
@@ -48,7 +47,7 @@ def read_imu_csv(path: Path, time_unit: str = "", *, in_order: bool = True) -> I
     Raises:
         MapError: The file cannot be read, has other columns, or its stamps do not increase.
     """
-    table = read_text_table(path, IMU, unit=time_unit)
+    table = text_table.read_text_table(path, stamps.IMU, unit=time_unit)
     places = _places(table)
     values = [
         table.columns(part, quantity)
@@ -68,7 +67,7 @@ def read_imu_csv(path: Path, time_unit: str = "", *, in_order: bool = True) -> I
     return ImuRecording(table.times_ns, np.concatenate(values, axis=1), table.line_numbers, note)
 
 
-def _places(table: TextTable) -> list[int]:
+def _places(table: text_table.TextTable) -> list[int]:
     """Return the places of accelerations and rates, x y z each, among the columns of values.
 
     Raises:
@@ -105,5 +104,5 @@ def write_imu_csv(recording: ImuRecording, path: Path, *, overwrite: bool = Fals
         UserError: The file exists and `overwrite` is not set, or it cannot be written.
     """
     values = recording.accel_gyro[:, [3, 4, 5, 0, 1, 2]]
-    rows = format_rows("%d" + ",%.17g" * 6, [recording.times_ns, values])
+    rows = text_table.format_rows("%d" + ",%.17g" * 6, [recording.times_ns, values])
     write_text(path, (text for part in ([_HEADER], rows) for text in part), overwrite=overwrite)

@@ -12,13 +12,10 @@ import numpy as np
 from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.distinct import distinct
 from maplab_py.errors import MapError, UserError
-from maplab_py.geometry import se3
-from maplab_py.geometry.interpolation import interpolate_poses, interpolate_vectors, slerp
-from maplab_py.interop.text_table import format_rows
-from maplab_py.interop.trajectories import Trajectory, write_tum
+from maplab_py.geometry import interpolation, se3
+from maplab_py.interop import text_table, trajectories
 from maplab_py.output_files import write_text
-from maplab_py.vimap import MissionSensor, VIMap, ids, ragged_rows
-from maplab_py.vimap.nav_state import NavState
+from maplab_py.vimap import MissionSensor, VIMap, ids, nav_state, ragged_rows
 
 ASL_FILE, RPG_FILE = "vertex_poses_velocities_biases.csv", "stamped_traj_estimate.txt"
 _ASL_HEADER = (
@@ -30,7 +27,7 @@ _ASL_HEADER = (
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class VertexStates(NavState):
+class VertexStates(nav_state.NavState):
     """States by mission, then time. S is the reference sensor, by default the IMU."""
 
     vertex: I64  # (N,) vertex row; the one before, for states between vertices
@@ -82,7 +79,7 @@ def poses_at(vi_map: VIMap, mission: int, times_ns: I64) -> F64:
     states = _mission_vertices(vi_map, rows)
     stamps = states.time_ns
     if len(stamps) < 2 or not vi_map.missions.sensor_id[mission, MissionSensor.IMU].any():
-        return interpolate_poses(stamps, states.T_M_I, times_ns)[0]
+        return interpolation.interpolate_poses(stamps, states.T_M_I, times_ns)[0]
     inside = np.clip(times_ns, stamps[0], stamps[-1])
     before = np.clip(np.searchsorted(stamps, inside, side="right") - 1, 0, len(stamps) - 2)
     T_M_I = _between(states, before, inside)
@@ -112,7 +109,7 @@ def write_asl(vi_map: VIMap, states: VertexStates, path: Path, *, overwrite: boo
         states.gyro_bias,
         states.accel_bias,
     ]
-    rows = format_rows("%d, %s, %s" + ", %.17g" * 23, columns)
+    rows = text_table.format_rows("%d, %s, %s" + ", %.17g" * 23, columns)
     write_text(path, chain([_ASL_HEADER], rows), overwrite=overwrite)
 
 
@@ -123,8 +120,8 @@ def write_rpg(states: VertexStates, path: Path, *, overwrite: bool = False) -> N
         UserError: The file exists and `overwrite` is not set, or it cannot be written.
     """
     order = np.argsort(states.time_ns, kind="stable")
-    trajectory = Trajectory(states.time_ns[order], states.T_G_S[order])
-    write_tum(trajectory, path, overwrite=overwrite)
+    trajectory = trajectories.Trajectory(states.time_ns[order], states.T_G_S[order])
+    trajectories.write_tum(trajectory, path, overwrite=overwrite)
 
 
 def _mission_vertices(vi_map: VIMap, rows: I64) -> VertexStates:
@@ -156,7 +153,7 @@ def _mission_states(vi_map: VIMap, mission: int, at_imu_times: bool) -> VertexSt
     before = np.clip(np.searchsorted(stamps, times, side="right") - 1, 0, len(stamps) - 2)
     T_M_I = _between(states, before, times)
     gyro_bias, accel_bias, v_M = (
-        interpolate_vectors(stamps, values, times)[0]
+        interpolation.interpolate_vectors(stamps, values, times)[0]
         for values in (states.gyro_bias, states.accel_bias, states.v_M)
     )
     T_G_I = se3.compose(vi_map.T_G_M[mission], T_M_I)
@@ -179,7 +176,7 @@ def _between(states: VertexStates, before: I64, times: I64) -> F64:
         + h[2][:, None] * B[:, 4:]
         + h[3][:, None] * states.v_M[after]
     )
-    return se3.make(slerp(A[:, :4], B[:, :4], s), p)
+    return se3.make(interpolation.slerp(A[:, :4], B[:, :4], s), p)
 
 
 def _mounting(vi_map: VIMap, mission: int, sensor_id: str) -> F64:

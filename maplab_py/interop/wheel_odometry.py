@@ -19,8 +19,7 @@ import numpy as np
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
-from maplab_py.interop.stamps import WHEELS
-from maplab_py.interop.text_table import TextTable, read_text_table
+from maplab_py.interop import stamps, text_table
 
 _MAX_RATE_RADPS = 30.0
 """Faster turns are degrees per second, or nothing that wheels do."""
@@ -70,7 +69,7 @@ def read_wheel_odometry(path: Path, time_unit: str = "") -> WheelTrack:
         MapError: The file cannot be read, has no such columns or fewer than two rows, stamps do not
             increase, a quaternion is none, or turns are not in radians.
     """
-    table = read_text_table(path, WHEELS, unit=time_unit)
+    table = text_table.read_text_table(path, stamps.WHEELS, unit=time_unit)
     kind, is_planar, columns = _columns(table)
     backwards = np.flatnonzero(np.diff(table.times_ns) <= 0)
     if len(backwards):
@@ -101,7 +100,7 @@ def accumulated(T_A_B: F64) -> F64:
     return product
 
 
-def _columns(table: TextTable) -> tuple[str, bool, F64]:
+def _columns(table: text_table.TextTable) -> tuple[str, bool, F64]:
     """Return what the rows are, whether they are planar, and the columns (N, 3, 6 or 7)."""
     names = [_ALIASES.get(name, _of_ros(name)) for name in table.names]
     for is_planar, kinds in ((False, _SPATIAL), (True, _PLANAR)):
@@ -132,7 +131,7 @@ def _quantity(name: str) -> str:
     return {"v": "velocity", "w": "rate"}.get(name[0], "angle" if "yaw" in name else "length")
 
 
-def _poses(table: TextTable, columns: F64, *, is_planar: bool) -> F64:
+def _poses(table: text_table.TextTable, columns: F64, *, is_planar: bool) -> F64:
     if is_planar:
         turn = np.zeros((len(columns), 3))
         turn[:, 2] = columns[:, 2]
@@ -147,7 +146,7 @@ def _poses(table: TextTable, columns: F64, *, is_planar: bool) -> F64:
     return se3.make(columns[:, 3:] / length[:, None], columns[:, :3])
 
 
-def _integrated(table: TextTable, columns: F64, *, is_planar: bool) -> F64:
+def _integrated(table: text_table.TextTable, columns: F64, *, is_planar: bool) -> F64:
     """Integrate velocities that change linearly between rows; the mean acts along a screw."""
     twist = np.zeros((len(columns), 6))
     twist[:, [0, 1, 5] if is_planar else slice(None)] = columns

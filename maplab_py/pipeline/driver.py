@@ -8,10 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from maplab_py.errors import Cancelled, UserError
-from maplab_py.pipeline import records
-from maplab_py.pipeline.engines import Engine, engine_of
-from maplab_py.pipeline.fingerprint import folder_hash, program_version
-from maplab_py.pipeline.messages import Ending, Order, Outcome
+from maplab_py.pipeline import engines, fingerprint, messages, records
 from maplab_py.pipeline.options import PipelineOptions
 from maplab_py.pipeline.plan import MAPS, Pipeline, Stage, ordered
 from maplab_py.pipeline.progress import (
@@ -22,7 +19,7 @@ from maplab_py.pipeline.progress import (
     Watcher,
 )
 
-_AGAIN = (Ending.FAILED, Ending.LOST)
+_AGAIN = (messages.Ending.FAILED, messages.Ending.LOST)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,7 +68,7 @@ class Driver:
     """
 
     def __init__(
-        self, pipeline: Pipeline, settings: RunSettings, engine: Engine, watcher: Watcher
+        self, pipeline: Pipeline, settings: RunSettings, engine: engines.Engine, watcher: Watcher
     ) -> None:
         """Check the pipeline and what an earlier run has left.
 
@@ -85,7 +82,7 @@ class Driver:
         stages = ordered(pipeline)
         self._stages = {s.name: _Progress(s, StageState(s.name)) for s in stages}
         self._records = records.Records(settings.results)
-        self._version = program_version()
+        self._version = fingerprint.program_version()
         self._ready: deque[records.Task] = deque()
         self._alone: deque[records.Task] = deque()  # took too much memory beside others
         self._running: dict[str, records.Task] = {}
@@ -219,7 +216,7 @@ class Driver:
 
     def _hash(self, folder: Path) -> str:
         if folder not in self._hashes:
-            self._hashes[folder] = folder_hash(folder)
+            self._hashes[folder] = fingerprint.folder_hash(folder)
         return self._hashes[folder]
 
     # running
@@ -245,7 +242,7 @@ class Driver:
             log.unlink(missing_ok=True)
             self._records.forget(task)
         self._attempts[task.title] = self._attempts.get(task.title, 0) + 1
-        order = Order(
+        order = messages.Order(
             title=task.title,
             script=task.script,
             flags=tuple(f"--{name}={text}" for name, text in sorted(self.settings.flags.items())),
@@ -267,7 +264,7 @@ class Driver:
         self._engine.submit(order)
         self._watcher.states([progress.state for progress in self._stages.values()])
 
-    def _take(self, outcome: Outcome) -> None:
+    def _take(self, outcome: messages.Outcome) -> None:
         """Note the end of a task, and decide whether it is tried again."""
         task = self._running.pop(outcome.title)
         progress = self._stages[task.stage]
@@ -276,16 +273,16 @@ class Driver:
         state.seconds += outcome.seconds
         state.peak_gb = max(state.peak_gb, outcome.peak_gb)
         attempts = self._attempts[task.title]
-        if outcome.ending is Ending.CANCELLED:
+        if outcome.ending is messages.Ending.CANCELLED:
             raise Cancelled("cancelled")
-        if outcome.ending is Ending.DONE:
+        if outcome.ending is messages.Ending.DONE:
             self._finish(task, outcome, attempts)
             state.done += 1
             progress.finished.append(task)
             self._watcher.line(f"{task.title}: done in {outcome.seconds:.1f} s")
             self._expand()
             return
-        is_first_excess = outcome.ending is Ending.OVER_MEMORY and attempts == 1
+        is_first_excess = outcome.ending is messages.Ending.OVER_MEMORY and attempts == 1
         if is_first_excess or (
             outcome.ending in _AGAIN and attempts <= self.settings.options.retries
         ):
@@ -301,7 +298,7 @@ class Driver:
             self._is_stopping = not self.settings.keep_going
         self._watcher.states([each.state for each in self._stages.values()])
 
-    def _finish(self, task: records.Task, outcome: Outcome, attempts: int) -> None:
+    def _finish(self, task: records.Task, outcome: messages.Outcome, attempts: int) -> None:
         self._hashes.pop(task.result, None)
         record = dataclasses.replace(
             self._record(task),
@@ -368,7 +365,7 @@ def run_pipeline(
     settings = RunSettings(
         options, results_folder.absolute(), Path.cwd(), dict(flags or {}), keep_going, discard
     )
-    engine = engine_of(options)
+    engine = engines.engine_of(options)
     driver = Driver(placed, settings, engine, watcher)
     with engine:
         if engine.address:

@@ -3,8 +3,7 @@
 from collections import deque
 from typing import Protocol, Self
 
-from maplab_py.pipeline.execution import execute
-from maplab_py.pipeline.messages import Order, Outcome
+from maplab_py.pipeline import execution, messages
 from maplab_py.pipeline.options import PipelineOptions
 
 
@@ -22,10 +21,10 @@ class Engine(Protocol):
     def share_gb(self) -> float:
         """Return the memory of a task when all slots are taken [GB]; 0 = no limit."""
 
-    def submit(self, order: Order) -> None:
+    def submit(self, order: messages.Order) -> None:
         """Take an order."""
 
-    def next_outcome(self) -> Outcome:
+    def next_outcome(self) -> messages.Outcome:
         """Wait until an order ends.
 
         Raises:
@@ -46,7 +45,7 @@ class SequentialEngine:
 
     def __init__(self) -> None:
         """Start without orders."""
-        self._orders: deque[Order] = deque()
+        self._orders: deque[messages.Order] = deque()
 
     def slots(self) -> int:
         """Return 1."""
@@ -60,13 +59,13 @@ class SequentialEngine:
         """Return 0: the task has the machine."""
         return 0.0
 
-    def submit(self, order: Order) -> None:
+    def submit(self, order: messages.Order) -> None:
         """Take an order."""
         self._orders.append(order)
 
-    def next_outcome(self) -> Outcome:
+    def next_outcome(self) -> messages.Outcome:
         """Run the next order."""
-        return execute(self._orders.popleft())
+        return execution.execute(self._orders.popleft())
 
     def __enter__(self) -> Self:
         """Start."""

@@ -19,9 +19,8 @@ from maplab_py.atomic import replaced_folder
 from maplab_py.child_processes import SECONDS_BETWEEN_LOOKS, kill, processors, start
 from maplab_py.errors import MaplabError, UserError
 from maplab_py.memory import resident_bytes, says_not_enough
-from maplab_py.pipeline.fingerprint import program_version
+from maplab_py.pipeline import fingerprint, plan
 from maplab_py.pipeline.messages import Ending, Order, Outcome
-from maplab_py.pipeline.plan import RESULT_TEMPLATE
 
 _USER_ERROR = 2
 _KILLED = -9
@@ -77,7 +76,7 @@ def _work_folder(order: Order) -> Path:
 
 
 def _written_to(order: Order, work: Path | None) -> Order:
-    script = order.script.replace(RESULT_TEMPLATE, shlex.quote(str(work or "")))
+    script = order.script.replace(plan.RESULT_TEMPLATE, shlex.quote(str(work or "")))
     return dataclasses.replace(order, script=script)
 
 
@@ -87,9 +86,9 @@ def _check_worker(order: Order) -> None:
     Raises:
         UserError: It has another version, or does not see a folder.
     """
-    if program_version() != order.version:
+    if fingerprint.program_version() != order.version:
         raise UserError(
-            f"worker {worker_name()} has maplab-py {program_version()}, the pipeline was started "
+            f"worker {worker_name()} has maplab-py {fingerprint.program_version()}, the pipeline was started "
             f"with {order.version}: install the same version"
         )
     for folder in (order.folder, order.log.parent, *order.inputs):

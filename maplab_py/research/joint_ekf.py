@@ -28,8 +28,7 @@ from maplab_py.algorithms.vi_optimization import calibration_states
 from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.blocks import ParameterBlocks
-from maplab_py.estimation.imu.inertial_data import InertialData
-from maplab_py.estimation.imu.preintegration import integrate
+from maplab_py.estimation.imu import inertial_data, preintegration
 from maplab_py.estimation.linear.threads import single_blas_thread
 from maplab_py.estimation.states import States
 from maplab_py.estimation.terms.cameras import EXTRINSICS, camera_blocks
@@ -181,9 +180,9 @@ class JointFilter:
         edge = self._edge_to.get(vertex, -1)
         if edge < 0:
             raise EstimationError("the filter needs an inertial edge between all vertices")
-        data = InertialData.of_map(self._map, np.array([edge]))
+        data = inertial_data.InertialData.of_map(self._map, np.array([edge]))
         imu = dataclasses.replace(self._imu, intrinsics=intrinsics_of(self.blocks)[0])
-        made = integrate(
+        made = preintegration.integrate(
             dataclasses.replace(data, imus=(imu,)),
             self.gyro_bias,
             self.accel_bias,

@@ -18,8 +18,7 @@ from maplab_py.errors import MaplabError, UserError
 from maplab_py.server.merging import Stretch, stretches_of
 from maplab_py.server.spool import Entry, Spool
 from maplab_py.storage.native import is_map_folder, load_map
-from maplab_py.vimap import VIMap, to_hex_list
-from maplab_py.vimap.edits import remove_missions
+from maplab_py.vimap import VIMap, edits, to_hex_list
 
 _FORMAT = 1
 
@@ -165,7 +164,7 @@ def recover(spool: Spool, map_folder: Path) -> Recovered:
 
 
 def _without(vi_map: VIMap, mask: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> VIMap | None:
-    return None if mask.all() else remove_missions(vi_map, mask)
+    return None if mask.all() else edits.remove_missions(vi_map, mask)
 
 
 def _without_lost(

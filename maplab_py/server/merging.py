@@ -29,13 +29,9 @@ from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import EstimationError
 from maplab_py.progress import SILENT, Progress
-from maplab_py.server.alignments import OpenAlignments, with_cloud_loops
+from maplab_py.server import alignments, spool
 from maplab_py.server.options import IncrementalOptions, MergingOptions
-from maplab_py.server.spool import with_resources_taken_in
-from maplab_py.vimap import IdArray, VIMap, from_hex, to_hex, to_hex_list
-from maplab_py.vimap.excerpts import Excerpt, excerpt
-from maplab_py.vimap.merge import merge_maps
-from maplab_py.vimap.submaps import append_submap
+from maplab_py.vimap import IdArray, VIMap, excerpts, from_hex, merge, submaps, to_hex, to_hex_list
 
 _LOCAL_ITERATIONS, _LOCAL_TOLERANCE = 10, 1e-3
 """Limits of a local optimisation: its vertices are optimised again with the next submaps, and jointly."""
@@ -98,7 +94,7 @@ class _NewPart:
 
     stretches: list[Stretch]
     rows: I64
-    part: Excerpt
+    part: excerpts.Excerpt
     searched: list[int]
     frequencies: F64
 
@@ -156,16 +152,16 @@ class Merger:
         self._places = PlaceIndex()
         self._projections = ProjectionMemory()
         self._stretches: list[Stretch] = []
-        self._open_alignments = OpenAlignments()
+        self._open_alignments = alignments.OpenAlignments()
 
     def restore(self, vi_map: VIMap, stretches: list[Stretch]) -> None:
         """Continue with a map that has been merged from some submaps."""
         self.vi_map, self._places, self._stretches = vi_map, PlaceIndex(), []
-        self._open_alignments = OpenAlignments()
+        self._open_alignments = alignments.OpenAlignments()
         for stretch in stretches:
             rows = stretch.vertices(vi_map)
             if len(rows):
-                self._remember(stretch, excerpt(vi_map, rows).vi_map)
+                self._remember(stretch, excerpts.excerpt(vi_map, rows).vi_map)
 
     def add(self, submap: VIMap, *, progress: Progress = SILENT) -> MergeSteps:
         """Merge a submap.
@@ -226,7 +222,7 @@ class Merger:
             vi_map = self._with_all_loops(vi_map, progress)
         options, self.note = self._optimization, ""
         if self._merging.enable_lidar_loop_closure and self._map_folder is not None:
-            vi_map, self.note = with_cloud_loops(vi_map, self._map_folder, progress)
+            vi_map, self.note = alignments.with_cloud_loops(vi_map, self._map_folder, progress)
             options = dataclasses.replace(options, include_loop_closure_edges=True)
         if self.radius > 0.0 and self._merging.preserve_trust_region_radius_across_merging:
             options = dataclasses.replace(options, initial_trust_region_radius=self.radius)
@@ -246,10 +242,10 @@ class Merger:
                 baseframes=submap.baseframes.replace(is_known=is_known | _place(submap))
             )
         if (base.mission_index.rows(submap.missions.id) >= 0).any():
-            return with_resources_taken_in(append_submap(base, submap)[0], submap)
+            return spool.with_resources_taken_in(submaps.append_submap(base, submap)[0], submap)
         frames = submap.baseframes.replace(is_known=_place(submap))
-        whole, _ = merge_maps(base, submap.replace(baseframes=frames))
-        return with_resources_taken_in(whole, submap)
+        whole, _ = merge.merge_maps(base, submap.replace(baseframes=frames))
+        return spool.with_resources_taken_in(whole, submap)
 
     def _similar(self, frequencies: F64) -> list[int]:
         """Return the numbers of the submaps that look most like one of some word frequencies (W,)."""
@@ -264,7 +260,7 @@ class Merger:
         rows = np.unique(np.concatenate([s.vertices(whole) for s in stretches]))
         frequencies = self._places.frequencies(submap)
         similar, known = self._similar(frequencies), len(self._stretches)
-        part = excerpt(whole, self._searched_vertices(whole, rows, similar))
+        part = excerpts.excerpt(whole, self._searched_vertices(whole, rows, similar))
         searched = [*similar, *range(known, known + len(stretches))]
         return _NewPart(stretches, rows, part, searched, frequencies)
 
@@ -333,7 +329,7 @@ class Merger:
         self,
         vi_map: VIMap,
         progress: Progress,
-        pairs: OpenAlignments | None = None,
+        pairs: alignments.OpenAlignments | None = None,
         searched: Sequence[int] = (),
     ) -> tuple[VIMap, tuple[str, ...], bool]:
         """Anchor what can be; also tell whether one of the missions has several submaps.
@@ -383,7 +379,7 @@ class Merger:
         missions = whole.mission_index.rows(_ids(waiting))
         inside = np.isin(whole.vertices.mission, missions)
         inside[np.concatenate(rows)] = True
-        part = excerpt(whole, inside)
+        part = excerpts.excerpt(whole, inside)
         edited, anchored, _ = self._anchor(part.vi_map, progress)
         return (part.written_back(edited) if anchored else whole), anchored
 

@@ -27,10 +27,8 @@ from maplab_py.server.publishing import Publisher
 from maplab_py.server.spool import Arrival, Entry, Spool
 from maplab_py.server.status import Events
 from maplab_py.server.worker import SubmapOrder
-from maplab_py.storage.mission_names import named
-from maplab_py.storage.native import is_map_folder, load_map
-from maplab_py.vimap import VIMap, to_hex
-from maplab_py.vimap.queries import has_link
+from maplab_py.storage import mission_names, native
+from maplab_py.vimap import VIMap, queries, to_hex
 
 _MAX_IMU_STEP_NS = 1_000_000_000
 """IMU samples that are farther apart are those of a clock that jumped."""
@@ -66,7 +64,7 @@ class Preparation:
             is_noted = (folder / _NOTE).read_text(encoding="utf-8") == self._key(entry)
         except (OSError, ValueError):
             return False
-        return is_noted and is_map_folder(folder / "prepared")
+        return is_noted and native.is_map_folder(folder / "prepared")
 
     def stop(self) -> None:
         """Kill what runs, and wait for its end."""
@@ -114,7 +112,7 @@ def check_submap(submap: VIMap) -> None:
         seconds = 1e-9 * float(step_ns[wrong[0]])
         raise MapError(f"its clock jumps by {seconds:.3f} s after {times_ns[wrong[0]]} ns")
     mission = submap.vertices.mission
-    gaps = np.flatnonzero(~has_link(submap)[:-1] & (mission[1:] == mission[:-1]))
+    gaps = np.flatnonzero(~queries.has_link(submap)[:-1] & (mission[1:] == mission[:-1]))
     if len(gaps):
         name = to_hex(submap.vertices.id[gaps[0]])
         raise MapError(
@@ -363,7 +361,7 @@ class Intake:
     def _prepared(self, item: Item) -> VIMap:
         """Return the prepared submap; raises MapError, or UserError where resources have no place."""
         folder = self._spool.folder(item.entry)
-        submap, _ = load_map(folder / "prepared")
+        submap, _ = native.load_map(folder / "prepared")
         check_submap(submap)
         submap = self._publisher.with_resources(submap, folder / "submap")
-        return named(submap, [item.entry.robot] * len(submap.missions))
+        return mission_names.named(submap, [item.entry.robot] * len(submap.missions))

@@ -36,8 +36,7 @@ from maplab_py.server.publishing import Display, Publisher, pause_s
 from maplab_py.server.service import Service, answers
 from maplab_py.server.spool import Spool, locked_spool
 from maplab_py.server.status import Events, status_of
-from maplab_py.vimap import VIMap, to_hex_list
-from maplab_py.vimap.edits import remove_missions
+from maplab_py.vimap import VIMap, edits, to_hex_list
 
 logger = logging.getLogger(__name__)
 
@@ -168,7 +167,7 @@ class MapServer:
         vertices = int(np.count_nonzero(mask[vi_map.vertices.mission]))
         self.journal = self.journal.without_missions(ids)
         write_journal(self.journal, self.spool.journal)
-        left = None if mask.all() else remove_missions(vi_map, mask)
+        left = None if mask.all() else edits.remove_missions(vi_map, mask)
         self._restore(left)
         self._publish()
         self.events.add(f"deleted mission {', '.join(sorted(ids))}")

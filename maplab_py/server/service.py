@@ -17,8 +17,7 @@ import numpy as np
 from maplab_py.array_types import F64
 from maplab_py.atomic import write_file
 from maplab_py.errors import MapError, MaplabError, UserError
-from maplab_py.geometry import se3
-from maplab_py.geometry.interpolation import interpolate_poses
+from maplab_py.geometry import interpolation, se3
 from maplab_py.report import Message, to_json
 from maplab_py.server.options import DeletedMissions, LookupReport
 from maplab_py.storage.resources.types import resource_type
@@ -254,7 +253,7 @@ def map_lookup(vi_map: VIMap, robot: str, timestamp_ns: int, sensor: str, p_S: F
             f"--timestamp_ns={timestamp_ns}: robot {robot} is not in the map then, but "
             + ", ".join(_times(vi_map, mission) for mission in rows)
         )
-    T_G_I, _ = interpolate_poses(
+    T_G_I, _ = interpolation.interpolate_poses(
         times_ns, vi_map.T_G_I[of_mission], np.array([timestamp_ns], dtype=np.int64)
     )
     T_G_S = T_G_I[0]

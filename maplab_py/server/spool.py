@@ -26,15 +26,12 @@ from pathlib import Path
 
 import numpy as np
 
-from maplab_py.atomic import move_folder, write_file
-from maplab_py.atomic.system import opened_locked
+from maplab_py.atomic import move_folder, system, write_file
 from maplab_py.errors import MapError, UserError
 from maplab_py.pipeline.fingerprint import folder_hash
-from maplab_py.storage import checksums
-from maplab_py.storage.native import is_map_folder
+from maplab_py.storage import checksums, native
 from maplab_py.storage.resources.store import MAP_FOLDER
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.merge import resource_folder_name
+from maplab_py.vimap import VIMap, merge
 
 _PUSHED = ".pushed.json"
 QUIET_S = 5.0
@@ -211,7 +208,7 @@ def push(spool: Spool, robot: str, submap: Path, name: str = "") -> Path:
     for flag, text in (("robot_name", robot), ("name", name)):
         if not text or "/" in text or text.startswith(".") or "\0" in text:
             raise UserError(f"--{flag}={text}: must be a name without / that begins with no dot")
-    if not is_map_folder(submap):
+    if not native.is_map_folder(submap):
         raise UserError(f"{submap} is not a map folder")
     target = spool.incoming / robot / name
     if target.exists():
@@ -238,7 +235,7 @@ def _arrival(robot: str, folder: Path, quiet_s: float) -> Arrival:
     if folder.is_symlink():
         return Arrival(robot, folder, False, "is a symbolic link: put the folder itself there")
     try:
-        reason = "" if is_map_folder(folder) else "is no complete map folder"
+        reason = "" if native.is_map_folder(folder) else "is no complete map folder"
         if not reason:
             checksums.verify(folder)
             pushed = folder / _PUSHED
@@ -291,7 +288,7 @@ def with_resources_taken_in(whole: VIMap, submap: VIMap) -> VIMap:
         submap: The submap.
     """
     folders = whole.metadata.external_resource_folders
-    name = resource_folder_name(submap.metadata)
+    name = merge.resource_folder_name(submap.metadata)
     if name not in folders:
         return whole
     index, folder = folders.index(name), whole.resources.folder
@@ -311,7 +308,7 @@ def locked_spool(spool: Spool) -> Iterator[None]:
         UserError: Another process holds it, or it cannot be made.
     """
     try:
-        descriptor = opened_locked(spool.lock)
+        descriptor = system.opened_locked(spool.lock)
     except OSError as error:
         raise UserError(f"{spool.lock}: cannot be locked ({error.strerror})") from error
     if descriptor is None:

@@ -15,8 +15,7 @@ from maplab_py.server.spool import Spool, push
 from maplab_py.storage.mission_names import with_folder_names
 from maplab_py.storage.native import find_maps, load_map, save_map
 from maplab_py.storage.resources.store import existing_files, in_map_folder
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.excerpts import cut_by_time, mission_maps, with_ids_of_times
+from maplab_py.vimap import VIMap, excerpts
 
 
 class SubmapWriter:
@@ -76,7 +75,7 @@ class SubmapWriter:
         submap = builder.make_part(self._mission, self._first)
         if submap is None:
             return
-        submap = with_ids_of_times(submap, f"{self._output.robot_name} {self._start_ns}")
+        submap = excerpts.with_ids_of_times(submap, f"{self._output.robot_name} {self._start_ns}")
         name = f"{self._start_ns}_submap_{self.pushed:03d}"
         with tempfile.TemporaryDirectory() as folder:
             save_map(submap, Path(folder) / name)
@@ -122,7 +121,7 @@ def recorded_sessions(maps_folder: Path) -> dict[str, RecordedSession]:
         raise UserError(f"--maps_folder={maps_folder}: there is no map in it or below it")
     sessions: dict[str, RecordedSession] = {}
     for folder in folders:
-        for part in mission_maps(with_folder_names(load_map(folder)[0], folder)):
+        for part in excerpts.mission_maps(with_folder_names(load_map(folder)[0], folder)):
             name = str(part.missions.name[0]).replace("/", "_").lstrip(".") or "robot"
             names = (name, *(f"{name}_{number}" for number in range(2, len(sessions) + 3)))
             robot = next(robot for robot in names if robot not in sessions)
@@ -147,7 +146,7 @@ def timed_submaps(
         folder = session.folder if isinstance(session, RecordedSession) else None
         vi_map = session.vi_map if isinstance(session, RecordedSession) else session
         begin_ns = int(vi_map.vertices.timestamp_ns.min())
-        for number, submap in enumerate(cut_by_time(vi_map, submap_s)):
+        for number, submap in enumerate(excerpts.cut_by_time(vi_map, submap_s)):
             end_s = 1e-9 * (int(submap.vertices.timestamp_ns.max()) - begin_ns)
             name = f"submap_{number:03d}"
             if folder is None:

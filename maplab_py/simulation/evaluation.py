@@ -14,8 +14,7 @@ from maplab_py.geometry.alignment import align_yaw_position, umeyama
 from maplab_py.report import Report
 from maplab_py.sensors import ImuIntrinsics
 from maplab_py.simulation.truth import Truth
-from maplab_py.vimap import IdIndex, MissionSensor, VIMap, mission_sensor_id, to_hex
-from maplab_py.vimap.table import ragged_rows, starts_of_counts
+from maplab_py.vimap import IdIndex, MissionSensor, VIMap, mission_sensor_id, table, to_hex
 
 _FALSE_EDGE_M, _FALSE_EDGE_DEG = 0.5, 5.0
 
@@ -285,9 +284,9 @@ def sightings(vi_map: VIMap, truth: Truth) -> Sightings:
     row = IdIndex(truth.frame_id).rows(vi_map.frames.id)
     usable = row >= 0
     usable[usable] = truth.frame_keypoints[row[usable]] == vi_map.frames.keypoint_count[usable]
-    start = starts_of_counts(truth.frame_keypoints)
-    of_truth = ragged_rows(start, row[usable])
-    of_map = ragged_rows(vi_map.keypoint_start, np.flatnonzero(usable))
+    start = table.starts_of_counts(truth.frame_keypoints)
+    of_truth = table.ragged_rows(start, row[usable])
+    of_map = table.ragged_rows(vi_map.keypoint_start, np.flatnonzero(usable))
     landmark = vi_map.keypoints.landmark[of_map].astype(np.int64)
     observing = landmark >= 0
     rows = of_truth[observing]

@@ -8,10 +8,9 @@ import numpy as np
 from maplab_py.array_types import F64
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
-from maplab_py.simulation.detection import is_hidden
+from maplab_py.simulation import detection, trajectory_motion
 from maplab_py.simulation.scenario import PATH_KINDS, MotionOptions, SessionOptions, WorldOptions
 from maplab_py.simulation.spline import PoseSpline
-from maplab_py.simulation.trajectory_motion import trajectory_spline
 from maplab_py.simulation.world import World, stair_half_length, street_route
 
 CONTROL_SPACING_S = 0.1
@@ -56,7 +55,7 @@ def motion_spline(
         UserError: The trajectory file cannot be used.
     """
     if options.trajectory:
-        return trajectory_spline(options, world, together)
+        return trajectory_motion.trajectory_spline(options, world, together)
     total = options.total_s
     count = int(np.ceil(total / CONTROL_SPACING_S)) + 4
     time: F64 = (np.arange(count, dtype=np.float64) - 1.0) * CONTROL_SPACING_S
@@ -85,7 +84,7 @@ def check_free_way(spline: PoseSpline, world: World, key: str) -> None:
     way = spline.control[:, 4:]
     low, high = world.bounds
     outside = np.any((way < low + _BODY_RADIUS_M) | (way > high - _BODY_RADIUS_M), axis=1)
-    blocked = np.append(is_hidden(world.boxes, way[:-1], way[1:]), False)
+    blocked = np.append(detection.is_hidden(world.boxes, way[:-1], way[1:]), False)
     inside = np.zeros(len(way), dtype=np.bool_)
     for box in world.boxes:
         inside |= np.all((way > box[0]) & (way < box[1]), axis=1)

@@ -20,19 +20,15 @@ from maplab_py.cancellation import lasting_effect
 from maplab_py.child_processes import in_order
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3
-from maplab_py.interop.imu_csv import ImuRecording as ImuFile
-from maplab_py.interop.imu_csv import write_imu_csv
-from maplab_py.interop.trajectories import Trajectory, write_euroc
+from maplab_py.interop import imu_csv, trajectories
 from maplab_py.output_files import write_text
 from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors import Camera, Distortion, Imu, Projection
-from maplab_py.simulation.imaging import Imager, make_brightness
-from maplab_py.simulation.ray_caster import painted_boxes
+from maplab_py.simulation import imaging, ray_caster, shading_kernels
 from maplab_py.simulation.reports import SimulatedMap, SimulatedMaps
 from maplab_py.simulation.scenario import Scenario
 from maplab_py.simulation.scene import make_scene
 from maplab_py.simulation.session import wheel_velocities, write_wheel_velocities
-from maplab_py.simulation.shading_kernels import PaintedBoxes
 from maplab_py.simulation.simulate import RecordedSession, SimulatedData, simulate
 from maplab_py.simulation.surfaces import Surfaces
 from maplab_py.storage.native import save_map
@@ -97,7 +93,7 @@ def write_raw_data(
         if scene is not None:
             rng = np.random.default_rng([scenario.seeds.appearance, _REPAINT_STREAM, number])
             share = scenario.sessions[number].images.repainted_share
-            painted = painted_boxes(scene.repainted(share, rng))
+            painted = ray_caster.painted_boxes(scene.repainted(share, rng))
             to = SessionFolders(target / "mav0", truth)
             write_images(scenario, number, session, painted, to, progress=progress)
         folders.append(target)
@@ -110,8 +106,8 @@ def _write_session(
     device, recording = session.device, session.recording
     imu = device.sensor_set.imu(device.imu_id)
     (mav / "imu0").mkdir(parents=True, exist_ok=True)
-    table = ImuFile(recording.imu_time_ns, recording.imu.accel_gyro)
-    write_imu_csv(table, mav / "imu0" / "data.csv", overwrite=overwrite)
+    table = imu_csv.ImuRecording(recording.imu_time_ns, recording.imu.accel_gyro)
+    imu_csv.write_imu_csv(table, mav / "imu0" / "data.csv", overwrite=overwrite)
     _write_lines(mav / "imu0" / "sensor.yaml", _imu_yaml(imu, scenario.imu.rate_hz), overwrite)
     stamps = [f"{stamp},{stamp}.png" for stamp in recording.time_ns.tolist()]
     for row, camera in enumerate(device.rig.cameras):
@@ -126,14 +122,14 @@ def _write_trajectory(session: RecordedSession, path: Path, *, overwrite: bool) 
     """Write the true states in the form of EuRoC's ground truth, G being the world."""
     recording = session.recording
     path.parent.mkdir(parents=True, exist_ok=True)
-    trajectory = Trajectory(
+    trajectory = trajectories.Trajectory(
         recording.imu_time_ns,
         recording.imu_motion.T_G_I,
         v_R=recording.imu_motion.v_G,
         gyro_bias=recording.imu.gyro_bias,
         accel_bias=recording.imu.accel_bias,
     )
-    write_euroc(trajectory, path, overwrite=overwrite)
+    trajectories.write_euroc(trajectory, path, overwrite=overwrite)
 
 
 def _write_lines(path: Path, lines: list[str], overwrite: bool) -> None:
@@ -200,7 +196,7 @@ def write_images(
     scenario: Scenario,
     number: int,
     session: RecordedSession,
-    painted: PaintedBoxes,
+    painted: shading_kernels.PaintedBoxes,
     folders: SessionFolders,
     *,
     threads: int | None = None,
@@ -223,7 +219,7 @@ def write_images(
     """
     count = len(session.recording.time_ns)
     seed = [scenario.seeds.measurement, _GAIN_STREAM, number]
-    brightness = make_brightness(
+    brightness = imaging.make_brightness(
         scenario.sessions[number].images,
         scenario.images.gain_swing,
         session.recording.spline.duration_s,
@@ -231,12 +227,12 @@ def write_images(
     )
     for row, camera in enumerate(session.device.true_rig.cameras):
         at_time, delay = _camera_motion(session, row), scenario.cameras[row].line_delay_s
-        imager = Imager.of(painted, camera, scenario.images, delay, at_time, brightness)
+        imager = imaging.Imager.of(painted, camera, scenario.images, delay, at_time, brightness)
         targets = folders.images / f"cam{row}" / "data", folders.depths / f"depth{row}"
         for target in targets[: 1 + scenario.images.depth]:
             target.mkdir(exist_ok=True)
 
-        def rendered(frame: int, row: int = row, imager: Imager = imager) -> list[bytes]:
+        def rendered(frame: int, row: int = row, imager: imaging.Imager = imager) -> list[bytes]:
             random = [scenario.seeds.measurement, _NOISE_STREAM, number, row, frame]
             time_s = float(session.recording.frame_s[frame])
             image, depth = imager.image(time_s, np.random.default_rng(random))

@@ -11,14 +11,13 @@ from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
 from maplab_py.interop.imu_csv import read_imu_csv
+from maplab_py.simulation import scene, trajectory_motion
 from maplab_py.simulation.detection import CameraPoses, Detections, detect
 from maplab_py.simulation.imu import ImuRecording, measure
 from maplab_py.simulation.motion import check_free_way, motion_spline
 from maplab_py.simulation.scenario import Scenario, SessionOptions
-from maplab_py.simulation.scene import SessionAppearance, describe
 from maplab_py.simulation.sensors import Device, DriftedStates, drift
 from maplab_py.simulation.spline import MotionState, PoseSpline
-from maplab_py.simulation.trajectory_motion import read_motion
 from maplab_py.simulation.world import World
 
 _EPOCH_NS = 1_600_000_000_000_000_000
@@ -58,7 +57,7 @@ def record(
     number: int,
     world: World,
     device: Device,
-    appearance: SessionAppearance,
+    appearance: scene.SessionAppearance,
     seeds: SessionSeeds,
     spline: PoseSpline | None = None,
 ) -> Recording:
@@ -105,7 +104,7 @@ def record(
         imu.take(kept),
         np.searchsorted(kept, clock.frame_row),
         detections,
-        describe(appearance, detections, seeds.appearance),
+        scene.describe(appearance, detections, seeds.appearance),
         spline,
         clock.sample_s[clock.frame_row] + clock.lead_s,
     )
@@ -169,7 +168,7 @@ def _detect_all(
     device: Device,
     spline: PoseSpline,
     clock: _Clock,
-    appearance: SessionAppearance,
+    appearance: scene.SessionAppearance,
     seeds: SessionSeeds,
 ) -> Detections:
     """Detect with every camera; images and tracks are numbered over all cameras."""
@@ -219,7 +218,7 @@ def recorded_samples(options: SessionOptions, lead_s: float = 0.0) -> RecordedSa
     """
     if not options.recorded_imu:
         return None
-    trajectory = read_motion(options)
+    trajectory = trajectory_motion.read_motion(options)
     if trajectory.gyro_bias is None or trajectory.accel_bias is None:
         raise UserError(
             f"sessions.recorded_imu: {trajectory.source} has no biases, which are part of the truth; "

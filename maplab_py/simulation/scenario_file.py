@@ -11,9 +11,8 @@ from typing import Any
 from maplab_py.errors import MapError, UserError
 from maplab_py.input_files import SCRIPT_MAX_BYTES, read_text
 from maplab_py.options import violation
-from maplab_py.sensors import Distortion, Projection
+from maplab_py.sensors import Distortion, Projection, yaml_text
 from maplab_py.sensors.camera import CAMERA_MODELS, DISTORTION_SIZE, INTRINSICS_SIZE
-from maplab_py.sensors.yaml_text import parse_yaml
 from maplab_py.simulation import scenario as sim
 from maplab_py.simulation.reports import ScenarioLine, ScenarioList
 
@@ -69,7 +68,7 @@ def parse_scenario(text: str, source: str) -> sim.Scenario:
         UserError: The text has a mistake; names source and key.
     """
     try:
-        content = parse_yaml(text, source)
+        content = yaml_text.parse_yaml(text, source)
     except MapError as error:
         raise UserError(_syntax_error(source, error)) from None
     try:

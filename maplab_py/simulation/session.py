@@ -9,20 +9,16 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64, U64, NDArray
 from maplab_py.errors import UserError
-from maplab_py.geometry import se3, so3
-from maplab_py.geometry.triangulation import triangulate
+from maplab_py.geometry import se3, so3, triangulation
 from maplab_py.interop.text_table import format_rows
 from maplab_py.output_files import write_text
-from maplab_py.sensors import Extrinsics, OtherSensor, SensorSet
-from maplab_py.sensors.projection import back_project
-from maplab_py.simulation.detection import Detections, sigma_of_octave
+from maplab_py.sensors import Extrinsics, OtherSensor, SensorSet, projection
+from maplab_py.simulation import detection, truth
 from maplab_py.simulation.recording import Recording, SessionSeeds
 from maplab_py.simulation.scenario import OtherSensorOptions, Scenario
 from maplab_py.simulation.sensors import Device, baseframe
-from maplab_py.simulation.truth import Truth, session_truth
 from maplab_py.simulation.world import World
-from maplab_py.vimap import TransformationKind, VIMap, starts_of_counts, tables
-from maplab_py.vimap.descriptors import binary_blocks
+from maplab_py.vimap import TransformationKind, VIMap, descriptors, starts_of_counts, tables
 from maplab_py.vimap.ids import from_hex, random_ids, to_hex
 
 _KEYPOINT_SCALE = 20.0
@@ -32,7 +28,7 @@ _MIN_SIGMA_PX = 0.1
 
 def session_map(
     scenario: Scenario, world: World, device: Device, recording: Recording, seeds: SessionSeeds
-) -> tuple[VIMap, Truth]:
+) -> tuple[VIMap, truth.Truth]:
     """Return a recorded session as a map with drifting states, and its truth.
 
     Raises:
@@ -43,7 +39,7 @@ def session_map(
     vi_map, is_true = add_other_sensors(
         vi_map, device.imu_id, recording, scenario.other_sensors, seeds.other
     )
-    return vi_map, session_truth(vi_map, recording, device, world, landmarks.point, is_true)
+    return vi_map, truth.session_truth(vi_map, recording, device, world, landmarks.point, is_true)
 
 
 def _assemble(
@@ -147,12 +143,12 @@ def _image_tables(
         camera_index=np.tile(np.arange(cameras), vertices),
         timestamp_ns=np.repeat(recording.time_ns, cameras),
         keypoint_count=keypoint_count,
-        descriptor_blocks=binary_blocks(keypoint_count, recording.descriptors.shape[1]),
+        descriptor_blocks=descriptors.binary_blocks(keypoint_count, recording.descriptors.shape[1]),
         present=np.full(count, int(present)),
     )
     factor = scenario.calibration.keypoint_noise_factor
     sigma = np.maximum(
-        factor * sigma_of_octave(scenario.measurement, detections.octave), _MIN_SIGMA_PX
+        factor * detection.sigma_of_octave(scenario.measurement, detections.octave), _MIN_SIGMA_PX
     )
     no_offset = np.zeros((len(detections.frame), 0), dtype=np.int32)
     keypoints = tables.Keypoints.filled(
@@ -168,7 +164,7 @@ def _image_tables(
     return frames, keypoints
 
 
-def _readout_ns(scenario: Scenario, detections: Detections) -> NDArray[np.int32]:
+def _readout_ns(scenario: Scenario, detections: detection.Detections) -> NDArray[np.int32]:
     """Return when (K, 1) keypoints are read out, counted from the image's time stamp."""
     camera = detections.frame % len(scenario.cameras)
     delay_s = np.array([options.line_delay_s for options in scenario.cameras])[camera]
@@ -203,7 +199,7 @@ def initial_landmarks(
     vertex = detections.frame // cameras
     T_M_C, ray_C = _rays(device, recording)
     ray_M = se3.transform(np.concatenate([T_M_C[:, :4], np.zeros((len(T_M_C), 3))], axis=1), ray_C)
-    p_M, ok, angle = triangulate(T_M_C[order, 4:], ray_M[order], start)
+    p_M, ok, angle = triangulation.triangulate(T_M_C[order, 4:], ray_M[order], start)
     p_of = np.repeat(p_M, length, axis=0)
     offset = p_of - T_M_C[order, 4:]
     behind = np.sum(offset * ray_M[order], axis=1) <= 0.0
@@ -237,7 +233,7 @@ def _rays(device: Device, recording: Recording) -> tuple[F64, F64]:
     rays = np.empty((len(detections.frame), 3))
     for row, camera in enumerate(cameras):
         of_camera = camera_row == row
-        rays[of_camera] = back_project(camera, detections.uv_px[of_camera])[0]
+        rays[of_camera] = projection.back_project(camera, detections.uv_px[of_camera])[0]
     return se3.compose(T_M_I, device.rig.T_B_C[camera_row]), rays
 
 

@@ -11,8 +11,7 @@ from maplab_py.algorithms.localization.localization import Localizations, Refere
 from maplab_py.array_types import F64, I64, U64, NDArray
 from maplab_py.atomic import replaced_file
 from maplab_py.errors import UserError
-from maplab_py.geometry import se3, so3
-from maplab_py.geometry.alignment import umeyama
+from maplab_py.geometry import alignment, se3, so3
 from maplab_py.input_files import read_npz
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.sensors import CameraRig, Imu, ImuIntrinsics, SensorSet
@@ -279,5 +278,5 @@ def true_poses(
     known = observer >= 0
     if known.sum() < 3:
         raise UserError(f"{path} is of another data set: it knows none of the map's vertices")
-    T_R_G, _ = umeyama(truth.T_G_I[observer[known], 4:], database.p_G_observer[known])
+    T_R_G, _ = alignment.umeyama(truth.T_G_I[observer[known], 4:], database.p_G_observer[known])
     return reference, T_R_G

@@ -11,11 +11,9 @@ import numpy as np
 from maplab_py.array_types import I64, U64
 from maplab_py.storage import maplab_map_pb2 as pb
 from maplab_py.storage.load_checks import FileFacts, check_file
+from maplab_py.storage.protobuf import scan, tables_from_messages, vertex_parts
 from maplab_py.storage.protobuf.ids import ids_of, ids_of_parts
 from maplab_py.storage.protobuf.map_files import FileKind, parse_message
-from maplab_py.storage.protobuf.scan import MemoryBudget
-from maplab_py.storage.protobuf.tables_from_messages import Content
-from maplab_py.storage.protobuf.vertex_parts import LISTED_EDGES, VertexPart, read_part
 from maplab_py.vimap.table import starts_of_counts
 
 _ENTITIES = {
@@ -34,7 +32,7 @@ class FileParts:
     def __init__(self) -> None:
         """Start without files."""
         self.facts: list[FileFacts] = []
-        self.vertices: list[VertexPart] = []
+        self.vertices: list[vertex_parts.VertexPart] = []
         self.unpacked_bytes = 0
         self._entities: dict[str, list[Any]] = {
             name: [] for name in ("edges", "missions", "baseframes")
@@ -44,7 +42,7 @@ class FileParts:
         self._index_path: Path | None = None
 
     def read(
-        self, kind: FileKind, path: Path, data: bytes | bytearray, budget: MemoryBudget
+        self, kind: FileKind, path: Path, data: bytes | bytearray, budget: scan.MemoryBudget
     ) -> None:
         """Parse the bytes of a file; of vertices and landmarks only tables are kept.
 
@@ -74,7 +72,7 @@ class FileParts:
         ):  # fmt: skip
             self._ids.setdefault(name, []).append(ids)
         if message.vertices:
-            part = read_part(path, message, budget.max_bytes)
+            part = vertex_parts.read_part(path, message, budget.max_bytes)
             self.vertices.append(part)
             budget.give_back(part.nbytes())
         elif len(entries):
@@ -115,12 +113,12 @@ class FileParts:
         self.facts.append(FileFacts(FileKind.LANDMARK_INDEX, path, False, False, False))
         return True
 
-    def content(self) -> Content:
+    def content(self) -> tables_from_messages.Content:
         """Return the entities of all files."""
         paths = tuple(facts.path for facts in self.facts)
         starts = starts_of_counts(np.array([part.count for part in self.vertices], dtype=np.int64))
         listed = {}
-        for field in LISTED_EDGES:
+        for field in vertex_parts.LISTED_EDGES:
             pairs = [part.listed[field] for part in self.vertices]
             owners = [owner + start for (owner, _), start in zip(pairs, starts[:-1], strict=True)]
             listed[field] = (
@@ -128,7 +126,7 @@ class FileParts:
                 _stacked([i for _, i in pairs], _NO_IDS),
             )
         ids = {name: _stacked(parts, _NO_IDS) for name, parts in self._ids.items()}
-        return Content(
+        return tables_from_messages.Content(
             vertex_ids=ids["vertex_ids"],
             vertex_mission_ids=_stacked([part.mission_ids for part in self.vertices], _NO_IDS),
             listed_edges=listed,

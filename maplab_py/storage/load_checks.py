@@ -21,8 +21,7 @@ from maplab_py.storage.protobuf.map_files import (
     FileKind,
 )
 from maplab_py.storage.protobuf.tables_from_messages import Content
-from maplab_py.vimap import IdIndex, VIMap, to_hex
-from maplab_py.vimap.consistency import Violation, check_loaded, check_saved
+from maplab_py.vimap import IdIndex, VIMap, consistency, to_hex
 
 _FIELDS = {
     FileKind.MISSIONS: ("missions", "mission_ids", "baseframes", "baseframe_ids"),
@@ -194,7 +193,7 @@ def consistency_notes(vi_map: VIMap) -> list[str]:
     Raises:
         MapError: The map violates a rule that every command requires; names the rule and an id.
     """
-    refused, tolerated = check_loaded(vi_map)
+    refused, tolerated = consistency.check_loaded(vi_map)
     if refused:
         remedy = (
             _REPAIR if _NO_NUMBER in refused[0].rule else "check_map_consistency lists such rules"
@@ -209,7 +208,7 @@ def check_loadable(vi_map: VIMap, folder: Path) -> None:
     Raises:
         MapError: It could not; names the rule and an id.
     """
-    refused = check_saved(vi_map)
+    refused = consistency.check_saved(vi_map)
     if refused:
         remedy = "save with --repair to drop what is no number"
         if _NO_NUMBER not in refused[0].rule:
@@ -219,7 +218,7 @@ def check_loadable(vi_map: VIMap, folder: Path) -> None:
         )
 
 
-def _said(violation: Violation) -> str:
+def _said(violation: consistency.Violation) -> str:
     where = f": {_some(violation.where)}" if violation.where else ""
     return f"{violation.rule} ({violation.count}){where}"
 

@@ -17,10 +17,8 @@ from maplab_py.errors import MapError
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
 from maplab_py.sensors.sensors_yaml import read_sensors
-from maplab_py.storage import load_checks
+from maplab_py.storage import checksums, file_assembly, load_checks, reading_processes
 from maplab_py.storage.cache.map_cache import CachedMap
-from maplab_py.storage.checksums import verify
-from maplab_py.storage.file_assembly import FileParts
 from maplab_py.storage.mission_names import with_names
 from maplab_py.storage.protobuf import (
     frames_from_messages,
@@ -40,7 +38,6 @@ from maplab_py.storage.protobuf.message_numbers import Name
 from maplab_py.storage.protobuf.scan import MemoryBudget
 from maplab_py.storage.protobuf.tables_from_messages import Content, required_rows, unique_index
 from maplab_py.storage.protobuf.vertex_parts import NO_TIME, JoinedParts, VertexPart
-from maplab_py.storage.reading_processes import parts_ahead
 from maplab_py.vimap import IdIndex, TransformationKind, VIMap, is_valid, starts_of_counts, to_hex
 from maplab_py.vimap.number_repair import without_bad_numbers
 from maplab_py.vimap.tables import Frames
@@ -132,7 +129,7 @@ def with_small_files(
         MapError: A file is damaged.
     """
     max_bytes = max_size_megabytes * 1_000_000
-    verify(folder, listed)
+    checksums.verify(folder, listed)
     metadata, _ = resources_from_messages.read_metadata(folder, max_bytes)
     sensors = read_sensors(folder / VI_MAP_FOLDER / SENSORS, max_bytes)
     vi_map = with_names(cached.vi_map.replace(sensors=sensors, metadata=metadata), folder)
@@ -162,7 +159,7 @@ def _load(
 ) -> tuple[VIMap, int, int, list[str]]:
     """Return the map, the number of its files and their unpacked bytes, and notes."""
     files = listed_files(folder, budget.max_bytes)
-    verify(folder, listed)
+    checksums.verify(folder, listed)
     with message_numbers.accept_bad_numbers() if repair else contextlib.nullcontext():
         return _loaded(folder, files, budget, repair, progress)
 
@@ -196,10 +193,10 @@ def _read_files(
     progress: Progress,
     *,
     in_processes: bool,
-) -> FileParts:
+) -> file_assembly.FileParts:
     """Read all files; those of vertices in other processes where that saves time."""
-    parts = FileParts()
-    with parts_ahead(files if in_processes else []) as ahead:
+    parts = file_assembly.FileParts()
+    with reading_processes.parts_ahead(files if in_processes else []) as ahead:
         if ahead is not None:
             ahead.start(budget)
             files = sorted(files, key=lambda file: file[0] is FileKind.VERTICES)  # others meanwhile

@@ -16,9 +16,8 @@ from maplab_py.cancellation import check_cancelled
 from maplab_py.errors import UserError
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
-from maplab_py.sensors import CameraRig, Distortion
+from maplab_py.sensors import CameraRig, Distortion, sensors_yaml
 from maplab_py.sensors.camera import is_known_to_maplab
-from maplab_py.sensors.sensors_yaml import write_sensors
 from maplab_py.storage import checksums, mission_names
 from maplab_py.storage import maplab_map_pb2 as pb
 from maplab_py.storage.load_checks import check_loadable
@@ -27,8 +26,7 @@ from maplab_py.storage.protobuf.descriptor_layout import LayoutChoice, with_layo
 from maplab_py.storage.protobuf.tables_to_messages import Partition
 from maplab_py.storage.resources.new import copied_files, with_staged_in_place
 from maplab_py.storage.unchanged_files import TakenOver, WrittenFiles
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.number_repair import without_bad_numbers
+from maplab_py.vimap import VIMap, number_repair
 
 RESOURCES = "resources"
 _GZIP_LEVEL = 1
@@ -89,7 +87,7 @@ def save_map(
             or it cannot be written; or the layout cannot hold the descriptors.
     """
     began = time.perf_counter()
-    vi_map, notes = without_bad_numbers(vi_map) if repair else (vi_map, [])
+    vi_map, notes = number_repair.without_bad_numbers(vi_map) if repair else (vi_map, [])
     check_loadable(vi_map, folder)
     resources = with_staged_in_place(with_layout(vi_map, descriptor_layout))
     folder = Path(folder).absolute()
@@ -201,7 +199,7 @@ def _write(
             _write_bytes(inner / content.name, content.data(), compress)
         listing.files.add(file_type=content.kind, path=content.name)
     _write_text(inner / map_files.VI_MAP_METADATA, text_format.MessageToString(listing))
-    _write_text(inner / map_files.SENSORS, write_sensors(vi_map.sensors))
+    _write_text(inner / map_files.SENSORS, sensors_yaml.write_sensors(vi_map.sensors))
     _write_message(
         folder / map_files.RESOURCE_INFO, tables_to_messages.resource_info(vi_map), compress
     )

@@ -16,11 +16,9 @@ import numpy as np
 from maplab_py.array_types import F32, U32, U64
 from maplab_py.errors import MapError
 from maplab_py.output_files import check_writable, write_bytes
-from maplab_py.sensors import SensorSet
-from maplab_py.sensors.sensors_yaml import parse_sensors, write_sensors
+from maplab_py.sensors import SensorSet, sensors_yaml
 from maplab_py.storage import maplab_map_pb2 as pb
-from maplab_py.storage.protobuf.map_files import COPY_AGAIN, read_message
-from maplab_py.storage.protobuf.scan import MemoryBudget
+from maplab_py.storage.protobuf import map_files, scan
 from maplab_py.vimap.descriptors import DescriptorDepth
 
 FILE_NAME = "localization_summary_map"
@@ -82,7 +80,7 @@ def read_summary_map(path: Path, *, max_size_megabytes: int = 2000) -> SummaryMa
     if file is None:
         raise MapError(f"{path}: there is no file {FILE_NAME}")
     message = pb.LocalizationSummaryMap()
-    read_message(file, message, MemoryBudget(max_size_megabytes * 1_000_000))
+    map_files.read_message(file, message, scan.MemoryBudget(max_size_megabytes * 1_000_000))
     inner = message.uncompressed_map
     summary = SummaryMap(
         p_G=_points(message.p_G_landmark, f"{file}: landmark positions"),
@@ -96,7 +94,7 @@ def read_summary_map(path: Path, *, max_size_megabytes: int = 2000) -> SummaryMa
         return summary
     summary = _with_extras(summary, message.extras, file)
     if message.extras.sha256 and message.extras.sha256 != _digest(summary):
-        raise MapError(f"{file}: is damaged: it does not have its checksum; {COPY_AGAIN}")
+        raise MapError(f"{file}: is damaged: it does not have its checksum; {map_files.COPY_AGAIN}")
     return summary
 
 
@@ -121,7 +119,7 @@ def _message(summary: SummaryMap) -> Any:
     if summary.descriptor_kind is not None:
         extras.descriptor_kind.extend(summary.descriptor_kind)
     if summary.sensors is not None:
-        extras.sensors_yaml = write_sensors(summary.sensors)
+        extras.sensors_yaml = sensors_yaml.write_sensors(summary.sensors)
     extras.sha256 = _digest(summary)
     return message
 
@@ -149,7 +147,7 @@ def _with_extras(summary: SummaryMap, extras: Any, file: Path) -> SummaryMap:
         columns["descriptor_kind"] = (kind[0], kind[1], kind[2]) if kind else None
         columns["projection"] = np.ascontiguousarray(matrix)
     if extras.sensors_yaml:
-        columns["sensors"] = parse_sensors(extras.sensors_yaml, f"{file}: sensors")
+        columns["sensors"] = sensors_yaml.parse_sensors(extras.sensors_yaml, f"{file}: sensors")
     return dataclasses.replace(summary, **columns)
 
 
@@ -176,7 +174,7 @@ def _digest(summary: SummaryMap) -> bytes:
         if isinstance(value, np.ndarray):
             digest.update(np.ascontiguousarray(value, value.dtype.newbyteorder("<")).tobytes())
         elif value is not None:
-            digest.update(write_sensors(value).encode())
+            digest.update(sensors_yaml.write_sensors(value).encode())
     return digest.digest()
 
 

@@ -9,12 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from maplab_py.array_types import I32, I64, Mask
 from maplab_py.distinct import distinct
-from maplab_py.vimap.edits import merge_landmarks, remove_landmarks, with_p_G
-from maplab_py.vimap.ids import IdArray
-from maplab_py.vimap.selection import as_mask, keep_rows
-from maplab_py.vimap.table import ragged_rows
-from maplab_py.vimap.tables import NO_ROW
-from maplab_py.vimap.vertex_removal import move_landmarks, stores_for
+from maplab_py.vimap import edits, ids, selection, table, tables, vertex_removal
 from maplab_py.vimap.vi_map import VIMap
 
 
@@ -63,7 +58,7 @@ class Excerpt:
         quality[rows] = edited.landmarks.quality
         whole = whole.replace(landmarks=whole.landmarks.replace(quality=quality))
         moved = self._moved(whole, rows, edited)
-        return with_p_G(whole, rows[moved], edited.p_G[moved])
+        return edits.with_p_G(whole, rows[moved], edited.p_G[moved])
 
     def _moved(self, whole: VIMap, rows: I64, edited: VIMap) -> Mask:
         """Return which landmarks of the edited part, rows of the whole, must get their positions.
@@ -99,21 +94,23 @@ class Excerpt:
     def _with_observations(self, whole: VIMap, edited: VIMap) -> VIMap:
         kept = self.vi_map.landmark_index.rows(edited.landmarks.id)  # rows of the part
         before, after = self.vi_map.keypoints.landmark, edited.keypoints.landmark
-        after = np.append(kept, NO_ROW)[after]
+        after = np.append(kept, tables.NO_ROW)[after]
         if len(kept) == len(self.landmarks) and np.array_equal(before, after):
             return whole
         is_kept = np.zeros(len(self.landmarks) + 1, dtype=np.bool_)
         is_kept[kept] = True
         moved = np.flatnonzero((before >= 0) & ~is_kept[before] & (after >= 0))
         source, target = _most_frequent(before[moved], after[moved])
-        merged = merge_landmarks(whole, self.landmarks[source], self.landmarks[target])
+        merged = edits.merge_landmarks(whole, self.landmarks[source], self.landmarks[target])
         rows = merged.landmark_index.rows(self.source.landmarks.id[self.landmarks])
         landmark = merged.keypoints.landmark.copy()
-        landmark[self.keypoints] = np.append(rows, NO_ROW)[after]
+        landmark[self.keypoints] = np.append(rows, tables.NO_ROW)[after]
         merged = merged.replace(keypoints=merged.keypoints.replace(landmark=landmark))
         absent = rows[~is_kept[:-1]]
         absent = absent[absent >= 0]
-        return remove_landmarks(merged, absent[np.diff(merged.observation_start)[absent] == 0])
+        return edits.remove_landmarks(
+            merged, absent[np.diff(merged.observation_start)[absent] == 0]
+        )
 
 
 def _most_frequent(source: I32, target: I32) -> tuple[I64, I64]:
@@ -137,24 +134,24 @@ def excerpt(vi_map: VIMap, vertices: ArrayLike, *, observed_by: ArrayLike | None
         observed_by: Vertices (rows or a mask) of which one must observe a landmark of the part; None
             = any of the part.
     """
-    is_in = as_mask(vertices, len(vi_map.vertices))
-    observing = is_in if observed_by is None else as_mask(observed_by, len(is_in)) & is_in
+    is_in = selection.as_mask(vertices, len(vi_map.vertices))
+    observing = is_in if observed_by is None else selection.as_mask(observed_by, len(is_in)) & is_in
     keypoints = vi_map.observations
     keypoints = keypoints[observing[vi_map.keypoint_vertex[keypoints]]]
     landmarks = distinct(vi_map.keypoints.landmark[keypoints]).astype(np.int64)
     homeless = landmarks[~is_in[vi_map.landmarks.vertex[landmarks]]]
-    store = stores_for(vi_map, homeless, is_in, same_mission=False)
-    moved = move_landmarks(vi_map, homeless, store)
+    store = vertex_removal.stores_for(vi_map, homeless, is_in, same_mission=False)
+    moved = vertex_removal.move_landmarks(vi_map, homeless, store)
     rows = np.flatnonzero(is_in)
     missions = distinct(vi_map.vertices.mission[rows]).astype(np.int64)
     frames = np.flatnonzero(is_in[vi_map.frames.vertex])
-    part = keep_rows(moved, missions=missions, vertices=rows, landmarks=landmarks)
+    part = selection.keep_rows(moved, missions=missions, vertices=rows, landmarks=landmarks)
     if not np.array_equal(part.frames.id, vi_map.frames.id[frames]):  # frames out of order
         frames = frames[
             np.lexsort((vi_map.frames.camera_index[frames], vi_map.frames.vertex[frames]))
         ]
     return Excerpt(
-        vi_map, part, missions, rows, landmarks, ragged_rows(vi_map.keypoint_start, frames)
+        vi_map, part, missions, rows, landmarks, table.ragged_rows(vi_map.keypoint_start, frames)
     )
 
 
@@ -212,7 +209,7 @@ def with_ids_of_times(vi_map: VIMap, mission: str) -> VIMap:
     )
 
 
-def _ids(purpose: str, *numbers: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> IdArray:
+def _ids(purpose: str, *numbers: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> ids.IdArray:
     """Return ids (N, 2) that follow from a text and some numbers (N,) each."""
     seed = np.frombuffer(hashlib.blake2b(purpose.encode(), digest_size=16).digest(), dtype="<u8")
     with np.errstate(over="ignore"):
@@ -222,7 +219,7 @@ def _ids(purpose: str, *numbers: np.ndarray[tuple[int, ...], np.dtype[np.int64]]
     return np.asarray(words | (words == 0).astype(np.uint64))
 
 
-def _mix(words: IdArray) -> IdArray:
+def _mix(words: ids.IdArray) -> ids.IdArray:
     """Return words whose every bit depends on all bits (the finaliser of splitmix64)."""
     words = (words ^ (words >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     words = (words ^ (words >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

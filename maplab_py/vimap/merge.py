@@ -7,10 +7,8 @@ import numpy as np
 from maplab_py.array_types import I32
 from maplab_py.errors import MapError
 from maplab_py.report import Report
-from maplab_py.vimap import tables
-from maplab_py.vimap.edits import content_rng, with_new_ids
+from maplab_py.vimap import edits, sensor_merge, tables
 from maplab_py.vimap.ids import as_keys, is_valid, random_ids, to_hex, to_hex_list
-from maplab_py.vimap.sensor_merge import conflicting_sensors, union, with_renamed_sensors
 from maplab_py.vimap.vi_map import MapMetadata, VIMap
 
 _UNIQUE_TABLES = {
@@ -55,7 +53,7 @@ def merge_maps(
         MapError: An id of `other` is in `base` already and `assign_new_ids` is off.
     """
     if assign_new_ids:
-        other = with_new_ids(other, content_rng(base, "merge", other))
+        other = edits.with_new_ids(other, edits.content_rng(base, "merge", other))
     check_disjoint(base, other)
     other, shared, renamed = with_compatible_sensors(base, other)
     merged = stack(base, other)
@@ -78,17 +76,17 @@ def with_compatible_sensors(
     Returns:
         The other map, the ids of shared sensors, and (old id, new id) of renamed ones.
     """
-    conflicts = conflicting_sensors(base.sensors, other.sensors)
+    conflicts = sensor_merge.conflicting_sensors(base.sensors, other.sensors)
     renamed: tuple[tuple[str, str], ...] = ()
     if conflicts:
-        new_ids = random_ids(len(conflicts), content_rng(base, "sensors", other))
+        new_ids = random_ids(len(conflicts), edits.content_rng(base, "sensors", other))
         renamed = tuple(zip(conflicts, to_hex_list(new_ids), strict=True))
     shared = tuple(
         sensor_id
         for sensor_id in other.sensors.sensors
         if sensor_id in base.sensors.sensors and sensor_id not in conflicts
     )
-    return with_renamed_sensors(other, dict(renamed)), shared, renamed
+    return sensor_merge.with_renamed_sensors(other, dict(renamed)), shared, renamed
 
 
 def check_disjoint(base: VIMap, other: VIMap) -> None:
@@ -139,7 +137,7 @@ def stack(base: VIMap, other: VIMap) -> VIMap:
     )
     vertices = other.vertices.replace(mission=_shift(other.vertices.mission, m))
     return base.replace(
-        sensors=union(base.sensors, other.sensors),
+        sensors=sensor_merge.union(base.sensors, other.sensors),
         metadata=metadata,
         missions=tables.Missions.concatenate([base.missions, missions]),
         baseframes=tables.BaseFrames.concatenate([base.baseframes, other.baseframes]),

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from maplab_py.geometry import se3
-from maplab_py.sensors import CameraRig, Extrinsics, OtherSensor, SensorSet
-from maplab_py.sensors.sensor_set import Sensor
+from maplab_py.sensors import CameraRig, Extrinsics, OtherSensor, SensorSet, sensor_set
 from maplab_py.vimap.ids import IdArray, from_hex, random_ids, to_hex
 from maplab_py.vimap.tables import MissionSensor
 from maplab_py.vimap.vi_map import VIMap
@@ -36,7 +35,7 @@ def conflicting_sensors(base: SensorSet, other: SensorSet) -> tuple[str, ...]:
         conflicts |= more
 
 
-def same_calibration(a: Sensor, b: Sensor) -> bool:
+def same_calibration(a: sensor_set.Sensor, b: sensor_set.Sensor) -> bool:
     """Return whether two calibrations are equal, ignoring texts, topics and unknown keys."""
     if type(a) is not type(b):
         return False
@@ -109,7 +108,7 @@ def _renamed_set(sensors: SensorSet, new_ids: Mapping[str, str]) -> SensorSet:
         base = new_ids.get(entry.base_sensor_id, entry.base_sensor_id)
         return dataclasses.replace(entry, base_sensor_id=base)
 
-    renamed: dict[str, Sensor] = {}
+    renamed: dict[str, sensor_set.Sensor] = {}
     for old, sensor in sensors.sensors.items():
         renamed[new_ids.get(old, old)] = (
             _with_id(sensor, new_ids[old]) if old in new_ids else sensor
@@ -118,7 +117,7 @@ def _renamed_set(sensors: SensorSet, new_ids: Mapping[str, str]) -> SensorSet:
     return dataclasses.replace(sensors, sensors=renamed, extrinsics=mounts)
 
 
-def _with_id(sensor: Sensor, sensor_id: str) -> Sensor:
+def _with_id(sensor: sensor_set.Sensor, sensor_id: str) -> sensor_set.Sensor:
     """Give a sensor another id; a rig's cameras get ids derived from it."""
     if isinstance(sensor, OtherSensor):
         keys = {**sensor.keys, "id": sensor_id} if "id" in sensor.keys else sensor.keys

@@ -12,9 +12,7 @@ from maplab_py.array_types import F64, NDArray
 from maplab_py.geometry import se3
 from maplab_py.report import counted, to_html
 from maplab_py.sensors import SensorSet
-from maplab_py.vimap.descriptors import binary_descriptor_sizes, feature_types
-from maplab_py.vimap.ids import IdIndex, to_hex, to_hex_list
-from maplab_py.vimap.staged_folder import StagedFolder
+from maplab_py.vimap import descriptors, ids, staged_folder
 from maplab_py.vimap.table import starts_of_counts
 from maplab_py.vimap.tables import (
     AbsolutePoses,
@@ -79,7 +77,7 @@ def mission_view(vi_map: VIMap, row: int) -> MissionView:
     baseframe = vi_map.missions.baseframe[row]
     return MissionView(
         row=row,
-        id=to_hex(vi_map.missions.id[row]),
+        id=ids.to_hex(vi_map.missions.id[row]),
         T_G_M=vi_map.baseframes.T_G_M[baseframe],
         is_T_G_M_known=bool(vi_map.baseframes.is_known[baseframe]),
         vertices=range(int(vi_map.vertex_start[row]), int(vi_map.vertex_start[row + 1])),
@@ -92,7 +90,7 @@ def vertex_view(vi_map: VIMap, row: int) -> VertexView:
     v = vi_map.vertices
     return VertexView(
         row=row,
-        id=to_hex(v.id[row]),
+        id=ids.to_hex(v.id[row]),
         mission=int(v.mission[row]),
         timestamp_ns=int(v.timestamp_ns[row]),
         T_M_I=v.T_M_I[row],
@@ -110,7 +108,7 @@ def landmark_view(vi_map: VIMap, row: int) -> LandmarkView:
     table, start = vi_map.landmarks, vi_map.observation_start
     return LandmarkView(
         row=row,
-        id=to_hex(table.id[row]),
+        id=ids.to_hex(table.id[row]),
         vertex=int(table.vertex[row]),
         p_I=table.p_I[row],
         p_G=vi_map.p_G[row],
@@ -130,7 +128,7 @@ class MapMetadata:
     external_resource_folders: tuple[str, ...] = ()
     # temporary folders among the external ones, not in the file: saving empties them into the
     # resource folder in use
-    staged_folders: tuple[StagedFolder, ...] = ()
+    staged_folders: tuple[staged_folder.StagedFolder, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -169,7 +167,7 @@ class VIMap:
     def _repr_html_(self) -> str:
         """Return the missions and the size of the map as tables, for notebooks."""
         of_mission = np.bincount(self.vertices.mission, minlength=len(self.missions))
-        words = to_hex_list(self.missions.id)
+        words = ids.to_hex_list(self.missions.id)
         missions = [
             {"mission": str(name) or word[:8], "id": word[:8], "vertices": int(count)}
             for name, word, count in zip(self.missions.name, words, of_mission, strict=True)
@@ -227,12 +225,12 @@ class VIMap:
     @cached_property
     def binary_descriptor_size(self) -> NDArray[np.int32]:
         """Bytes (K,) of each keypoint's binary descriptor, 0 where it has none."""
-        return binary_descriptor_sizes(self.frames)
+        return descriptors.binary_descriptor_sizes(self.frames)
 
     @cached_property
     def feature_type(self) -> NDArray[np.int32]:
         """Feature type (K,) of each keypoint's descriptor, -1 where it has none."""
-        return feature_types(self.frames)
+        return descriptors.feature_types(self.frames)
 
     @cached_property
     def observations(self) -> NDArray[np.int64]:
@@ -268,19 +266,19 @@ class VIMap:
     # -- ids ------------------------------------------------------------------------------------
 
     @cached_property
-    def mission_index(self) -> IdIndex:
+    def mission_index(self) -> ids.IdIndex:
         """Look-up of mission rows by id."""
-        return IdIndex(self.missions.id)
+        return ids.IdIndex(self.missions.id)
 
     @cached_property
-    def vertex_index(self) -> IdIndex:
+    def vertex_index(self) -> ids.IdIndex:
         """Look-up of vertex rows by id."""
-        return IdIndex(self.vertices.id)
+        return ids.IdIndex(self.vertices.id)
 
     @cached_property
-    def landmark_index(self) -> IdIndex:
+    def landmark_index(self) -> ids.IdIndex:
         """Look-up of landmark rows by id."""
-        return IdIndex(self.landmarks.id)
+        return ids.IdIndex(self.landmarks.id)
 
     # -- rows as objects ------------------------------------------------------------------------
 

@@ -1,7 +1,6 @@
 """Manipulation of the pose graph: uncertainties, switch variables, disturbed vertices."""
 
-from maplab_py.algorithms.pose_graph_manipulation import layout
-from maplab_py.algorithms.pose_graph_manipulation.edges import EdgeType
+from maplab_py.algorithms.pose_graph_manipulation import edges, layout
 from maplab_py.plugin import ALL_MISSIONS, CommandContext, Message, MissionChoice, command
 from maplab_py.report import counted
 
@@ -15,7 +14,7 @@ from maplab_py.report import counted
 def assign_edge_uncertainties(
     context: CommandContext,
     *,
-    edge_type: EdgeType,
+    edge_type: edges.EdgeType,
     translation_std_dev_meters: float = -1.0,
     orientation_std_dev_degrees: float = -1.0,
 ) -> Message:

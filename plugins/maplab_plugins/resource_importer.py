@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from maplab_py.interop.resources.depth_maps import DepthImportOptions
-from maplab_py.interop.resources.images import ImageImportOptions
+from maplab_py.interop.resources import depth_maps, images
 from maplab_py.plugin import CommandContext, command
 
 if TYPE_CHECKING:
@@ -24,7 +23,7 @@ def import_images(
     dataset_folder: Path,
     *,
     map_mission: str = "",
-    options: ImageImportOptions = ImageImportOptions(),
+    options: images.ImageImportOptions = images.ImageImportOptions(),
 ) -> ImportedResources:
     """Attach the images of an EuRoC or TUM-VI folder to the frames of a mission.
 
@@ -92,7 +91,7 @@ def import_depth_maps(
     *,
     map_mission: str = "",
     camera: int = 0,
-    options: DepthImportOptions = DepthImportOptions(),
+    options: depth_maps.DepthImportOptions = depth_maps.DepthImportOptions(),
 ) -> ImportedResources:
     """Attach depth images of another program to the frames of a camera, as raw depth maps.
 

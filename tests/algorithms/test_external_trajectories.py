@@ -9,8 +9,7 @@ import pytest
 from maplab_py.algorithms.external_poses.alignment import robust_yaw_position
 from maplab_py.console.session.session import Session
 from maplab_py.errors import EstimationError, MapError, MaplabError, UserError
-from maplab_py.geometry import se3, so3
-from maplab_py.geometry.interpolation import interpolate_poses
+from maplab_py.geometry import interpolation, se3, so3
 from maplab_py.interop.trajectories import Trajectory, read_kitti, write_euroc, write_tum
 from maplab_py.vimap import TransformationKind, VIMap
 from maplab_py.vimap.consistency import check_consistency
@@ -34,7 +33,7 @@ def truth(vi_map: VIMap, mission: int = 0, T_I_S: Any = None) -> Trajectory:
     stamps = vi_map.vertices.timestamp_ns[rows]
     times = np.linspace(0, int(stamps[-1] - stamps[0]), 10 * (len(rows) - 1) + 1)
     times_ns = stamps[0] + times.astype(np.int64)
-    T_M_I = interpolate_poses(stamps, vi_map.vertices.T_M_I[rows], times_ns)[0]
+    T_M_I = interpolation.interpolate_poses(stamps, vi_map.vertices.T_M_I[rows], times_ns)[0]
     T_R_S = se3.compose(se3.compose(TURN, T_M_I), se3.identity() if T_I_S is None else T_I_S)
     return Trajectory(times_ns, T_R_S)
 

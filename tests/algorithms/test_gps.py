@@ -9,20 +9,17 @@ import numpy as np
 import pymap3d
 import pytest
 
-from maplab_py.algorithms.external_poses.gps import origin_of
+from maplab_py.algorithms.external_poses import gps, trajectories
 from maplab_py.algorithms.external_poses.options import TrajectoryOptions
-from maplab_py.algorithms.external_poses.trajectories import as_mission
 from maplab_py.algorithms.vi_optimization.factor_terms import absolute_outliers
 from maplab_py.algorithms.vi_optimization.map_problem import build
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.console.session.session import Session
 from maplab_py.errors import MaplabError, UserError
-from maplab_py.geometry import se3, so3
-from maplab_py.geometry.alignment import umeyama
+from maplab_py.geometry import alignment, se3, so3
 from maplab_py.interop.gps import read_gps
 from maplab_py.interop.trajectories import Trajectory
-from maplab_py.vimap import AbsolutePoses, VIMap
-from maplab_py.vimap.merge import merge_maps
+from maplab_py.vimap import AbsolutePoses, VIMap, merge
 
 ORIGIN = (47.3769, 8.5417, 450.0)
 START_NS = 1_700_000_000_000_000_000
@@ -104,14 +101,14 @@ def write_nmea(path: Path, times_ns: Any, p: Any, *, with_date: bool = True) -> 
 
 def map_of(trajectory: Trajectory) -> VIMap:
     options = TrajectoryOptions(position_sigma_m=0.06, orientation_sigma_deg=0.1)
-    return as_mission(trajectory, options)
+    return trajectories.as_mission(trajectory, options)
 
 
 def errors_m(vi_map: VIMap, truth: Trajectory) -> tuple[float, float]:
     """Return the root mean square error in G without alignment, and the scale against the truth."""
     p = vi_map.T_G_I[:, 4:]
     error = np.linalg.norm(p - truth.T_R_B[:, 4:], axis=1)
-    scale = umeyama(truth.T_R_B[:, 4:], p, with_scale=True)[1]
+    scale = alignment.umeyama(truth.T_R_B[:, 4:], p, with_scale=True)[1]
     return float(np.sqrt(np.mean(error**2))), scale
 
 
@@ -150,10 +147,10 @@ def test_a_drifting_loop_with_outliers(seed: int, tmp_path: Path) -> None:
         assert abs(scale - 1.0) <= 0.002
         assert result.absolute_poses_rejected == np.count_nonzero(found)
         assert "nothing of 1 cluster" in result.gauge
-        assert origin_of(session.vi_map) == ORIGIN
+        assert gps.origin_of(session.vi_map) == ORIGIN
         session.run("save", map_folder=tmp_path / "map")
         session.run("load", map_folder=tmp_path / "map", map_key="again")
-        assert origin_of(session.vi_map) == ORIGIN
+        assert gps.origin_of(session.vi_map) == ORIGIN
 
 
 def test_positions_say_nothing_of_orientation(tmp_path: Path) -> None:
@@ -206,7 +203,7 @@ def test_g_becomes_east_north_up(tmp_path: Path) -> None:
             with pytest.raises(UserError, match="--gps_replace"):
                 session.run("import_gps", gps_file=path, **flags)
             session.run("import_gps", gps_file=path, gps_replace=True)  # the map's origin
-            assert origin_of(session.vi_map) == ORIGIN
+            assert gps.origin_of(session.vi_map) == ORIGIN
             session.run("undo")
             assert session.vi_map is after
 
@@ -214,7 +211,7 @@ def test_g_becomes_east_north_up(tmp_path: Path) -> None:
 def test_a_map_has_one_origin_and_known_missions_move_along(tmp_path: Path) -> None:
     first, later = loop(60, 2, 20.0), loop(60, 2, 20.0)
     later = dataclasses.replace(later, times_ns=later.times_ns + 10**12)
-    vi_map = merge_maps(map_of(first), map_of(later))[0]
+    vi_map = merge.merge_maps(map_of(first), map_of(later))[0]
     known = np.ones(2, dtype=np.bool_)
     vi_map = vi_map.replace(baseframes=vi_map.baseframes.replace(is_known=known))
     missions = [vi_map.mission(row).id[:8] for row in range(2)]
@@ -233,7 +230,7 @@ def test_a_map_has_one_origin_and_known_missions_move_along(tmp_path: Path) -> N
         before = session.vi_map
         session.run("import_gps", **flags)
         np.testing.assert_allclose(session.vi_map.T_G_M, before.T_G_M, atol=1e-6)
-        assert origin_of(session.vi_map) == origin_of(before)
+        assert gps.origin_of(session.vi_map) == gps.origin_of(before)
 
 
 def test_nmea_of_every_kind(tmp_path: Path) -> None:

@@ -19,13 +19,11 @@ from maplab_py.geometry import se3, so3
 from maplab_py.interop.wheel_odometry import accumulated, read_wheel_odometry
 from maplab_py.sensors import Extrinsics, OtherSensor
 from maplab_py.sensors.wheels import wheel_scale, with_wheel_scale
-from maplab_py.simulation.evaluation import evaluate_map
-from maplab_py.simulation.scenario_file import load_scenario
+from maplab_py.simulation import evaluation, scenario_file
 from maplab_py.simulation.session import wheel_velocities, write_wheel_velocities
 from maplab_py.simulation.simulate import simulate
-from maplab_py.vimap import Backbone, MissionSensor, TransformationKind, VIMap, to_hex
+from maplab_py.vimap import Backbone, MissionSensor, TransformationKind, VIMap, merge, to_hex
 from maplab_py.vimap.consistency import check_consistency
-from maplab_py.vimap.merge import merge_maps
 from maplab_py.vimap.vertex_removal import join_transformation_edges
 from tests.support.scene import Scene
 from tests.vimap.builders import IMU_ID, STEP_NS, walk_map
@@ -184,7 +182,7 @@ def test_files_merging_and_keyframes_keep_wheels(session: Session, tmp_path: Pat
         read_wheel_odometry(shifted),
         WheelOptions(sensor_id=sensor_id),
     ).vi_map
-    merged = merge_maps(scaled, other)[0]
+    merged = merge.merge_maps(scaled, other)[0]
     edges = wheel_edges(merged)
     assert len(edges) == 2 * (VERTICES - 1)
     scales = {wheel_scale(merged.sensors, to_hex(words)) for words in edges.sensor_id}
@@ -355,7 +353,7 @@ def test_wheels_of_unknown_scale_do_not_fix_the_scale_of_images(tmp_path: Path) 
 def test_simulated_wheels_give_their_scale_to_a_tenth_of_a_percent(
     seed: int, tmp_path: Path
 ) -> None:
-    scenario = load_scenario("vehicle").with_seed(seed)
+    scenario = scenario_file.load_scenario("vehicle").with_seed(seed)
     data = simulate(scenario)
     recording = data.recordings[0].recording
     wheels = wheel_velocities(recording, scenario.other_sensors, np.random.default_rng(seed))
@@ -374,4 +372,4 @@ def test_simulated_wheels_give_their_scale_to_a_tenth_of_a_percent(
         )
         scale = wheel_scale(session.vi_map.sensors, report.sensor_id)
         assert abs(scale / 1.02 - 1.0) <= 0.001
-        assert evaluate_map(session.vi_map, data.truth).ate_m < 0.05
+        assert evaluation.evaluate_map(session.vi_map, data.truth).ate_m < 0.05

@@ -9,8 +9,7 @@ from maplab_py.simulation.scenario import SessionOptions
 from maplab_py.simulation.scenario_file import check_scenario
 from maplab_py.simulation.world import pitch_m
 from maplab_py.storage.native import load_map
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.edits import merge_landmarks
+from maplab_py.vimap import VIMap, edits
 
 
 def _streets(session: SessionOptions) -> set[tuple[int, int, int, int]]:
@@ -58,7 +57,7 @@ def test_sessions_are_written_once_and_wrong_merges_are_counted(tmp_path) -> Non
     assert merges_of_strangers(vi_map, truth) == 0
     points = truth.point_G[truth.landmark_point[-len(vi_map.landmarks) :]]
     far = int(np.argmax(np.linalg.norm(points - points[0], axis=1)))
-    merged = merge_landmarks(vi_map, np.array([far]), np.array([0]))
+    merged = edits.merge_landmarks(vi_map, np.array([far]), np.array([0]))
     assert merges_of_strangers(merged, truth) == 1
 
 

@@ -6,9 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.image_features.extraction import extract_features
+from maplab_py.algorithms.image_features import extraction, tracks
 from maplab_py.algorithms.image_features.options import ExtractionOptions, FeatureTrackOptions
-from maplab_py.algorithms.image_features.tracks import track_features
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
 from maplab_py.algorithms.landmarks.tracks import init_tracks
 from maplab_py.console.commands.lines import split_commands
@@ -35,8 +34,8 @@ def described(room: StereoRoom) -> VIMap:
     vi_map = import_images(room.true_map, 0, room.recording)[0]
     options = ExtractionOptions(max_features=300, replace=True)
     blank = vi_map.frames.replace(descriptor_blocks=np.array([None] * len(vi_map.frames)))
-    sift, _ = extract_features(vi_map.replace(frames=blank), Path(), options)
-    tracked, _ = track_features(sift, FeatureTrackOptions())
+    sift, _ = extraction.extract_features(vi_map.replace(frames=blank), Path(), options)
+    tracked, _ = tracks.track_features(sift, FeatureTrackOptions())
     return init_tracks(tracked, LandmarkQualityOptions())[0]
 
 

@@ -9,10 +9,9 @@ from maplab_py.storage.native import save_map
 from maplab_py.vimap import VIMap
 from tests.algorithms.image_features.test_extraction import room, with_images
 from tests.docs.test_example_plugin import install_example, run_maplab
-from tests.support.data import REPOSITORY
-from tests.support.small_network import FEATURES, NUMBERS, write_network
+from tests.support import data, small_network
 
-EXAMPLE = REPOSITORY / "docs" / "examples" / "maplab_onnx"
+EXAMPLE = data.REPOSITORY / "docs" / "examples" / "maplab_onnx"
 __all__ = ["room", "with_images"]
 
 
@@ -33,7 +32,7 @@ def map_folder(with_images: VIMap, tmp_path_factory: pytest.TempPathFactory) -> 
 def test_a_network_gives_features_and_landmarks(
     installed: Path, map_folder: Path, tmp_path: Path
 ) -> None:
-    write_network(tmp_path / "net.onnx")
+    small_network.write_network(tmp_path / "net.onnx")
     line = (
         f"load {map_folder}; extract_features --feature_type=plugin:onnx "
         f"--feature_model={tmp_path / 'net.onnx'} --max_features=120; "
@@ -45,8 +44,8 @@ def test_a_network_gives_features_and_landmarks(
     reports = [json.loads(text)["report"] for text in done.stdout.splitlines()]
     extraction, tracks, landmarks = reports[1:4]
     assert extraction["feature_type"] == "SuperPoint"
-    assert extraction["descriptor_bytes"] == 4 * NUMBERS
-    assert extraction["median_per_image"] == min(120, FEATURES)
+    assert extraction["descriptor_bytes"] == 4 * small_network.NUMBERS
+    assert extraction["median_per_image"] == min(120, small_network.FEATURES)
     assert tracks["tracks"] > 30
     assert landmarks["landmarks_added"] > 10
 
@@ -64,7 +63,7 @@ def test_files_that_are_no_such_network(
     installed: Path, map_folder: Path, tmp_path: Path, model: str, message: str
 ) -> None:
     (tmp_path / "text.onnx").write_text("no network")
-    write_network(tmp_path / "part.onnx", outputs=("keypoints", "scores"))
+    small_network.write_network(tmp_path / "part.onnx", outputs=("keypoints", "scores"))
     flag = f"--feature_model={tmp_path / model}" if model else ""
     line = f"load {map_folder}; extract_features --feature_type=plugin:onnx {flag}"
     done = run_maplab(installed, "-c", line)

@@ -7,9 +7,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.support.data import shared_data
+from tests.support import data, machine
 from tests.support.interruptions import Interrupter, Workspace
-from tests.support.machine import slowness
 
 pytestmark = pytest.mark.slow
 
@@ -31,7 +30,7 @@ NAMES = (
 
 @pytest.fixture(scope="module")
 def interrupter(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Interrupter]:
-    tango = shared_data("maplab_maps/tango_handheld")
+    tango = data.shared_data("maplab_maps/tango_handheld")
     console = Interrupter(Workspace(tmp_path_factory.mktemp("interruptions"), tango))
     yield console
     console.close()
@@ -43,4 +42,4 @@ def test_the_prompt_is_back_and_nothing_has_changed(interrupter: Interrupter, na
     assert [press for press in presses if press.harm] == []
     assert {press.outcome for press in presses} <= {"cancelled", "done"}
     # other work on the machine may hold one of them up: the second slowest counts
-    assert sorted(press.prompt_s for press in presses)[-2] <= PROMPT_S * slowness(), presses
+    assert sorted(press.prompt_s for press in presses)[-2] <= PROMPT_S * machine.slowness(), presses

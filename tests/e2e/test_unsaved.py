@@ -12,8 +12,7 @@ import pytest
 from tests.console import sample_plugin
 from tests.docs.markdown import blocks
 from tests.e2e.support import Console, run_program
-from tests.support.data import REPOSITORY
-from tests.support.waiting import wait_until
+from tests.support import data, waiting
 
 
 @pytest.fixture
@@ -56,7 +55,7 @@ def test_a_console_that_ignores_hang_ups_ends_with_its_terminal(
     console = Console(tmp_path, ignores_hang_ups=True, **with_plugin)
     console.wait_for_prompt()
     console.enter("create_new_map a; add_mission; !touch running; !sleep 1; echo words")
-    assert wait_until((tmp_path / "running").exists)
+    assert waiting.wait_until((tmp_path / "running").exists)
     pid = console.child.pid
     os.close(console.child.child_fd)
     assert ended_with(pid) == 1
@@ -112,7 +111,7 @@ def files_of(folder: Path) -> dict[str, bytes]:
 
 @pytest.mark.slow
 def test_the_script_of_the_tutorial_makes_a_byte_identical_map(tmp_path: Path) -> None:
-    parts = [text for _, text in blocks(REPOSITORY / "docs" / "tutorial.md", "maplab")]
+    parts = [text for _, text in blocks(data.REPOSITORY / "docs" / "tutorial.md", "maplab")]
     second = next(i for i, text in enumerate(parts) if "three_sessions" in text)
     (tmp_path / "tutorial.maplab").write_text(
         "\n".join(parts[second:]) + "\nundo\nredo\nhistory --as_script > steps.maplab\n"

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.data import REPOSITORY
-from tests.support.programs import module_of_tests
+from tests.support import data, programs
 
 KINDS = {
     "openat": "open",
@@ -31,7 +30,7 @@ TRACED = (
 
 
 def run(*words: str) -> str:
-    done = subprocess.run(words, cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    done = subprocess.run(words, cwd=data.REPOSITORY, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -53,7 +52,7 @@ def traced_calls(log: str, folder: Path) -> Counter[str]:
 @pytest.mark.skipif(shutil.which("strace") is None, reason="there is no strace")
 @pytest.mark.parametrize("name", ["replaced map", "csv", "segment database"])
 def test_no_call_is_missed(tmp_path: Path, name: str) -> None:
-    program = module_of_tests("tests.faults")
+    program = programs.module_of_tests("tests.faults")
     log, folder, other = tmp_path / "log", tmp_path / "strace", tmp_path / "counted"
     probe = subprocess.run(["strace", "-o", str(log), "true"], check=False, capture_output=True)
     if probe.returncode != 0:

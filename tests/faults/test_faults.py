@@ -8,8 +8,7 @@ import sys
 import pytest
 
 from tests.faults.scenarios import SCENARIOS
-from tests.support.data import REPOSITORY
-from tests.support.programs import module_of_tests
+from tests.support import data, programs
 
 QUICK = ("csv", "files of one command", "segment database", "summary map", "aliases", "history")
 """Scenarios of a few seconds; those of maps have hundreds of faults."""
@@ -21,8 +20,8 @@ NAMES = [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for
 @pytest.mark.parametrize("name", NAMES)
 def test_every_system_call_may_fail_or_be_the_last(name: str) -> None:
     done = subprocess.run(
-        [*module_of_tests("tests.faults"), name],
-        cwd=REPOSITORY,
+        [*programs.module_of_tests("tests.faults"), name],
+        cwd=data.REPOSITORY,
         env={**os.environ, "MPLBACKEND": "Agg"},
         capture_output=True,
         text=True,

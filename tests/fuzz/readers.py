@@ -26,24 +26,18 @@ from maplab_py.algorithms.self_calibration.segments.database import (
     save_database,
 )
 from maplab_py.errors import MaplabError
+from maplab_py.interop import calibration_export, external_closures, g2o, gps, imu_csv, trajectories
 from maplab_py.interop.bags.listing import bag_info
-from maplab_py.interop.calibration_export import exported
 from maplab_py.interop.calibration_import import import_calibration
+from maplab_py.interop.colmap import features, importing
 from maplab_py.interop.colmap.exporting import export_colmap
-from maplab_py.interop.colmap.features import ColmapDatabase
-from maplab_py.interop.colmap.importing import read_times
 from maplab_py.interop.colmap.options import ColmapExportOptions
 from maplab_py.interop.colmap.reading import read_cameras, read_model
-from maplab_py.interop.external_closures import read_external_closures
-from maplab_py.interop.g2o import read_g2o
-from maplab_py.interop.gps import read_gps
-from maplab_py.interop.imu_csv import read_imu_csv
 from maplab_py.interop.ply import PlyCloud, encode_ply, parse_ply
 from maplab_py.interop.recordings.options import SourceOptions
 from maplab_py.interop.recordings.protocol import CameraImage
 from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.resources.point_clouds import parse_pcd
-from maplab_py.interop.trajectories import read_trajectory
 from maplab_py.interop.wheel_odometry import read_wheel_odometry
 from maplab_py.sensors import CameraRig, Imu
 from maplab_py.sensors.sensors_yaml import read_sensors, write_sensors
@@ -116,7 +110,7 @@ def _calibration_seeds(folder: Path) -> list[bytes]:
     ids = [
         next(k for k, v in sensors.sensors.items() if isinstance(v, t)) for t in (Imu, CameraRig)
     ]
-    (basalt,) = exported(sensors, *ids, "basalt", imu_rate_hz=200.0).values()
+    (basalt,) = calibration_export.exported(sensors, *ids, "basalt", imu_rate_hz=200.0).values()
     seeds += [b"\1" + text.encode() for text in (small_files.realsense(), basalt)]
     seeds.append(b"\2RadTan 458 457 320 240 -0.28 0.07 0 0\n640 480\ncrop\n640 480\n")
     seeds.append(b"\3# cameras\n1 OPENCV 640 480 500 500 320 240 0.1 0 0 0\n")
@@ -176,9 +170,9 @@ def _table_seeds(folder: Path) -> list[bytes]:
 def _read_table(folder: Path, data: bytes) -> None:
     path = _named(folder, _TABLES, data)
     readers: tuple[Callable[[Path], object], ...] = (
-        lambda file: read_trajectory(file, needs_orientation=False),
-        *(read_imu_csv, read_wheel_odometry, read_times),
-        lambda file: read_external_closures(_map(), file),
+        lambda file: trajectories.read_trajectory(file, needs_orientation=False),
+        *(imu_csv.read_imu_csv, read_wheel_odometry, importing.read_times),
+        lambda file: external_closures.read_external_closures(_map(), file),
     )
     readers[_TABLES.index(path.name)](path)
 
@@ -206,7 +200,7 @@ def _gps_seeds(folder: Path) -> list[bytes]:
 
 
 def _read_gps(folder: Path, data: bytes) -> None:
-    read_gps(_named(folder, ("track.nmea", "track.csv"), data))
+    gps.read_gps(_named(folder, ("track.nmea", "track.csv"), data))
 
 
 def _g2o_seeds(folder: Path) -> list[bytes]:
@@ -222,7 +216,7 @@ def _g2o_seeds(folder: Path) -> list[bytes]:
 def _read_g2o(folder: Path, data: bytes) -> None:
     path = folder / "graph.g2o"
     path.write_bytes(data)
-    read_g2o(path)
+    g2o.read_g2o(path)
 
 
 # -- clouds -------------------------------------------------------------------------------------
@@ -290,7 +284,7 @@ def _database_seeds(folder: Path) -> list[bytes]:
 def _read_database(folder: Path, data: bytes) -> None:
     path = folder / "database.db"
     path.write_bytes(data)
-    database = ColmapDatabase(path)
+    database = features.ColmapDatabase(path)
     try:
         for name, uv in _keypoints_of(_prepared(folder, "database", _database_seeds)):
             database.features(name, uv)

@@ -14,8 +14,7 @@ from maplab_py.interop.calibration_export import (
     lower_triangular,
     rotated_lower_triangular,
 )
-from maplab_py.sensors import Distortion
-from maplab_py.sensors.sensors_yaml import parse_sensors
+from maplab_py.sensors import Distortion, sensors_yaml
 from tests.algorithms.self_calibration.scenes import INTRINSICS, device, scene_map
 from tests.support.imu_model import distort_imu
 
@@ -98,7 +97,7 @@ def test_basalt_means_the_same() -> None:
 
 
 def test_maplab_yaml_reads_back() -> None:
-    again = parse_sensors(written("maplab")["sensors.yaml"], "exported")
+    again = sensors_yaml.parse_sensors(written("maplab")["sensors.yaml"], "exported")
     imu, rig = device(scene_map(distortion=Distortion.RADTAN))
     np.testing.assert_allclose(again.imu(imu.id).intrinsics.T_g, INTRINSICS.T_g, atol=1e-15)
     np.testing.assert_allclose(

@@ -20,14 +20,11 @@ from maplab_py.interop.colmap.options import ColmapExportOptions
 from maplab_py.interop.csv_dataset import CsvExportOptions, export_csv_dataset
 from maplab_py.interop.imu_csv import read_imu_csv
 from maplab_py.interop.ply import PlyCloud, write_ply
-from maplab_py.interop.recordings.bag_writing import BagFormat
-from maplab_py.interop.recordings.map_replay import mission_sample_rows
+from maplab_py.interop.recordings import bag_writing, map_replay, reader_choice
 from maplab_py.interop.recordings.options import SourceOptions
-from maplab_py.interop.recordings.reader_choice import given_device
 from maplab_py.interop.resources.point_clouds import read_cloud
 from maplab_py.interop.trajectories import Trajectory, read_trajectory, write_euroc, write_tum
-from maplab_py.sensors import Distortion
-from maplab_py.sensors.sensors_yaml import write_sensors
+from maplab_py.sensors import Distortion, sensors_yaml
 from maplab_py.storage.native import save_map
 from maplab_py.vimap import VIMap
 from tests.algorithms.self_calibration.scenes import scene_map
@@ -199,7 +196,7 @@ def test_calibrations_are_read_by_the_import_and_by_flags(form: str, tmp_path: P
         report: Any = session.run("import_calibration", **flags)
         assert len(report.cameras) == len(vi_map.sensors.camera_rig(device.rig).cameras)
     flags = dict(zip(("sensor_calibration_file", "imu_calibration_file"), files, strict=False))
-    read = given_device(SourceOptions(**flags), "a bag")
+    read = reader_choice.given_device(SourceOptions(**flags), "a bag")
     expected = vi_map.sensors.camera_rig(device.rig).cameras
     for camera, own in zip(read.cameras, expected, strict=True):
         np.testing.assert_allclose(camera.intrinsics, own.intrinsics, rtol=1e-12)
@@ -226,12 +223,12 @@ def test_graphs_are_read_with_their_values(tmp_path: Path) -> None:
     assert np.linalg.norm(so3.log(turns), axis=1).max() < 1e-9
 
 
-@pytest.mark.parametrize("kind", BagFormat)
-def test_bags_are_described_by_recording_info(kind: BagFormat, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", bag_writing.BagFormat)
+def test_bags_are_described_by_recording_info(kind: bag_writing.BagFormat, tmp_path: Path) -> None:
     vi_map, images, _ = map_with_resources()
     path = named(tmp_path, kind)
     export_bag(vi_map, tmp_path, 0, path, BagExportOptions(format=kind.value))
-    (tmp_path / "sensors.yaml").write_text(write_sensors(vi_map.sensors))
+    (tmp_path / "sensors.yaml").write_text(sensors_yaml.write_sensors(vi_map.sensors))
     with Session() as session:
         report: Any = session.run(
             "recording_info",
@@ -240,7 +237,7 @@ def test_bags_are_described_by_recording_info(kind: BagFormat, tmp_path: Path) -
             imu_topic="/imu0",
         )
     assert report.frame_sets == len(images)
-    assert report.imu.samples == len(mission_sample_rows(vi_map, 0))
+    assert report.imu.samples == len(map_replay.mission_sample_rows(vi_map, 0))
     assert report.notes == ()
 
 

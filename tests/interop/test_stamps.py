@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from maplab_py.errors import MapError
+from maplab_py.interop import text_table, trajectories
 from maplab_py.interop.stamps import (
     FIXES,
     IMAGES,
@@ -16,8 +17,6 @@ from maplab_py.interop.stamps import (
     parse_stamps,
     read_stamps,
 )
-from maplab_py.interop.text_table import parse_text_table
-from maplab_py.interop.trajectories import read_trajectory
 
 NOW = 1403715273262142976
 
@@ -98,13 +97,13 @@ def test_the_unit_of_a_header_holds(tmp_path: Path) -> None:
     pose = "1,2,3,1,0,0,0"
     header = "#timestamp [{}], p_x [m], p_y [m], p_z [m], q_w, q_x, q_y, q_z\n"
     path.write_text(header.format("ns") + f"0,{pose}\n50000000,{pose}\n100000000,{pose}\n")
-    assert read_trajectory(path).times_ns.tolist() == [0, 50_000_000, 100_000_000]
+    assert trajectories.read_trajectory(path).times_ns.tolist() == [0, 50_000_000, 100_000_000]
     path.write_text(header.format("us") + f"1700000000000000,{pose}\n1700000001000000,{pose}\n")
-    assert np.diff(read_trajectory(path).times_ns).tolist() == [10**9]
+    assert np.diff(trajectories.read_trajectory(path).times_ns).tolist() == [10**9]
     path.write_text(
         "# stamps in microseconds\n" + header.format("").replace("[]", "") + f"7,{pose}\n"
     )
-    assert read_trajectory(path).times_ns.tolist() == [7000]
+    assert trajectories.read_trajectory(path).times_ns.tolist() == [7000]
 
 
 def test_names_hold_wherever_their_line_stands() -> None:
@@ -115,7 +114,7 @@ def test_names_hold_wherever_their_line_stands() -> None:
         "# a b c\n" + names + "#\n" + rows,
         rows + names,
     ):
-        table = parse_text_table(text, "t.txt")
+        table = text_table.parse_text_table(text, "t.txt")
         assert table.header == ("timestamp", "x", "y")
         assert table.times_ns.tolist() == [1_000_000, 3_000_000]
 

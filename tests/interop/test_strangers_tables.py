@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from maplab_py.errors import MapError
-from maplab_py.interop.gps import read_gps
+from maplab_py.interop import gps, wheel_odometry
 from maplab_py.interop.imu_csv import read_imu_csv
 from maplab_py.interop.trajectories import read_trajectory
-from maplab_py.interop.wheel_odometry import read_wheel_odometry
 
 NOW, STEP = 1403715273262142976, 50_000_000
 TURN = [0.1, 0.2, 0.3, 0.9273618495495703]  # x y z w
@@ -179,7 +178,7 @@ def test_gravity_tells_which_columns_without_names_are_accelerations(tmp_path: P
     ],
 )  # fmt: skip
 def test_wheels(tmp_path: Path, header: str, row: str, x_m: float, yaw_rad: float) -> None:
-    track = read_wheel_odometry(written(tmp_path, header, row))
+    track = wheel_odometry.read_wheel_odometry(written(tmp_path, header, row))
     np.testing.assert_allclose(track.T_O_S[-1, 4:], [x_m, 0.0, 0.0], atol=1e-12)
     assert 2.0 * np.arctan2(*track.T_O_S[-1, 2:4]) == pytest.approx(yaw_rad, abs=1e-12)
 
@@ -196,7 +195,7 @@ def test_wheels(tmp_path: Path, header: str, row: str, x_m: float, yaw_rad: floa
     ],
 )  # fmt: skip
 def test_fixes(tmp_path: Path, header: str, row: str, altitude_m: float) -> None:
-    track = read_gps(written(tmp_path, header, row))
+    track = gps.read_gps(written(tmp_path, header, row))
     assert track.times_ns.tolist() == [(1_700_000_000 + k) * 10**9 for k in range(5)]
     assert (track.latitude_deg[0], track.longitude_deg[0]) == (47.1, 8.5)
     np.testing.assert_allclose(track.altitude_m, altitude_m, rtol=1e-15)
@@ -204,10 +203,10 @@ def test_fixes(tmp_path: Path, header: str, row: str, altitude_m: float) -> None
 
 @pytest.mark.parametrize("row", ["17{row},47.1,S,8.5,W,400", "17{row},47.1 S,,8.5W,,400"])
 def test_hemispheres(tmp_path: Path, row: str) -> None:
-    track = read_gps(written(tmp_path, "t [s],lat,ns,lon,ew,alt", row))
+    track = gps.read_gps(written(tmp_path, "t [s],lat,ns,lon,ew,alt", row))
     assert (track.latitude_deg[0], track.longitude_deg[0]) == (-47.1, -8.5)
 
 
 def test_gpx_is_named(tmp_path: Path) -> None:
     with pytest.raises(MapError, match="is XML, as GPX or KML: convert it to CSV"):
-        read_gps(written(tmp_path, "<?xml version='1.0'?><gpx>", "<trkpt lat='47' lon='8'/>"))
+        gps.read_gps(written(tmp_path, "<?xml version='1.0'?><gpx>", "<trkpt lat='47' lon='8'/>"))

@@ -14,8 +14,7 @@ from maplab_py.errors import EstimationError, UserError
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.plotting import maps, time_series
 from maplab_py.plotting.figure import check_plot_file, write_figure
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.queries import coobservation_counts
+from maplab_py.vimap import VIMap, queries
 from tests.simulation.small import simulated
 
 
@@ -76,7 +75,7 @@ def test_landmark_histograms_count_every_landmark(vi_map: VIMap) -> None:
 
 def test_coobservability_writes_the_counts(vi_map: VIMap) -> None:
     axes = maps.coobservability(vi_map).axes[0]
-    counts = coobservation_counts(vi_map)
+    counts = queries.coobservation_counts(vi_map)
     assert [text.get_text() for text in axes.texts] == [str(n) for n in counts.ravel()]
 
 

@@ -12,8 +12,7 @@ from maplab_py.algorithms.evaluation.reports import MapComparisonReport
 from maplab_py.console.session.session import Session
 from maplab_py.errors import UserError
 from maplab_py.interop.colmap.options import ColmapImportReport
-from maplab_py.vimap.ids import to_hex
-from maplab_py.vimap.queries import is_metric
+from maplab_py.vimap import ids, queries
 from tests.algorithms.loop_closure.rooms import Walk, make_map
 from tests.interop.test_mvs import read_by_colmap
 from tests.support.scene import Scene
@@ -48,7 +47,7 @@ def test_out_in_and_compared(session: Session, tmp_path: Path) -> None:
 def test_missions_are_chosen(tmp_path: Path) -> None:
     session = Session()
     session.maps.add("two", Scene(missions=2, vertices=5, landmarks=60).make())
-    name = to_hex(session.vi_map.missions.id[0])
+    name = ids.to_hex(session.vi_map.missions.id[0])
     session.run("export_colmap", colmap_folder=tmp_path, missions=name)
     session.run("import_colmap", colmap_folder=tmp_path, map_key="part")
     assert len(session.vi_map.missions) == 1
@@ -85,7 +84,7 @@ def test_arbitrary_scale_is_refused_by_optvi_alone(session: Session, tmp_path: P
     session.run("export_colmap", colmap_folder=tmp_path, quality="all")
     (tmp_path / "maplab.npz").unlink()
     session.run("import_colmap", colmap_folder=tmp_path, map_key="model")
-    assert not is_metric(session.vi_map, 0)
+    assert not queries.is_metric(session.vi_map, 0)
     with pytest.raises(UserError, match="scale and gravity are arbitrary"):
         session.run("optvi")
     session.run("optv", ba_num_iterations=2)

@@ -12,11 +12,8 @@ from maplab_py.algorithms.self_calibration.device import device_of
 from maplab_py.console.session.session import Session
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.interop.trajectories import read_trajectory
-from maplab_py.sensors import Distortion
-from maplab_py.sensors.sensors_yaml import read_sensors
-from maplab_py.sensors.yaml_text import parse_yaml
-from maplab_py.vimap import VIMap, ids
-from maplab_py.vimap.merge import merge_maps
+from maplab_py.sensors import Distortion, sensors_yaml, yaml_text
+from maplab_py.vimap import VIMap, ids, merge
 from maplab_py.vision.projection import DescriptorProjection, save_projection
 from tests.algorithms.self_calibration.scenes import scene_map
 from tests.interop.recordings.written import make_content, write_folder
@@ -48,7 +45,7 @@ def test_csv_export(tmp_path: Path, session: Session) -> None:
 
 def test_projected_descriptors_are_those_of_loop_closure(tmp_path: Path) -> None:
     session = Session()
-    session.maps.add("walk", merge_maps(*simulated().maps)[0])
+    session.maps.add("walk", merge.merge_maps(*simulated().maps)[0])
     vi_map = session.vi_map
     session.run("csv_export", csv_export_path=tmp_path / "csv", export_projected_descriptor=True)
     features, projection = map_features(vi_map, np.arange(2))
@@ -126,7 +123,7 @@ def test_trajectory_options(tmp_path: Path, session: Session) -> None:
 
 def test_ncamera_calibration_reads_back(tmp_path: Path, session: Session) -> None:
     report = session.run("encc", ncamera_calibration_export_folder=tmp_path / "calibration")
-    rig = read_sensors(report.files[0]).camera_rig(RIG_ID)
+    rig = sensors_yaml.read_sensors(report.files[0]).camera_rig(RIG_ID)
     expected = session.vi_map.sensors.camera_rig(RIG_ID)
     assert np.array_equal(rig.cameras[0].intrinsics, expected.cameras[0].intrinsics)
     assert np.allclose(rig.T_B_C, expected.T_B_C, atol=1e-15)
@@ -142,7 +139,7 @@ def test_mission_info_lists_every_map(tmp_path: Path, session: Session) -> None:
     path = tmp_path / "info.yaml"
     report = session.run("export_mission_info", mission_info_export_path=path)
     missions = ids.to_hex_list(session.vi_map.missions.id)
-    assert parse_yaml(path.read_text(), "info") == {"small": missions, "other": []}
+    assert yaml_text.parse_yaml(path.read_text(), "info") == {"small": missions, "other": []}
     assert report.rows == 2
 
 
@@ -189,7 +186,7 @@ def test_a_calibration_is_looked_at_and_written(tmp_path: Path) -> None:
         flags = {"calibration_file": chain, "imu_calibration_file": imu, "sensors_file": sensors}
         report = session.run("import_calibration", **flags)
         assert report.cameras[0].time_shift_s == pytest.approx(0.004)
-        assert len(read_sensors(sensors).sensors) == 2
+        assert len(sensors_yaml.read_sensors(sensors).sensors) == 2
         with pytest.raises(UserError, match=r"sensors\.yaml"):
             session.run("import_calibration", **flags)
         session.run("import_calibration", **flags, overwrite=True)

@@ -7,8 +7,7 @@ import pytest
 
 from maplab_py.console.session.session import Session
 from maplab_py.errors import EstimationError, UserError
-from maplab_py.storage.native import is_map_folder
-from maplab_py.storage.summary_map import read_summary_map
+from maplab_py.storage import native, summary_map
 from tests.support import descriptor_blocks as by_hand
 from tests.support.data import shared_data
 
@@ -44,7 +43,7 @@ def test_save_writes_the_layout_that_is_asked_for(several: Path, tmp_path: Path)
                     descriptor_layout="legacy",
                     **arguments,
                 )
-        assert not is_map_folder(tmp_path / "all" / "legacy")
+        assert not native.is_map_folder(tmp_path / "all" / "legacy")
         session.run("save_all", maps_folder=tmp_path / "all", descriptor_layout="2.2")
         saved = by_hand.described(tmp_path / "all" / "several")
         assert saved == by_hand.described(several)
@@ -59,7 +58,7 @@ def test_places_and_summary_maps_take_binary_descriptors(several: Path, tmp_path
         vi_map = session.vi_map
         good = np.append(vi_map.landmarks.quality == 2, False)[vi_map.keypoints.landmark]
         usable = np.count_nonzero(good & (vi_map.binary_descriptor_size > 0))
-        observations = len(read_summary_map(tmp_path).descriptors)
+        observations = len(summary_map.read_summary_map(tmp_path).descriptors)
         assert 0.95 * usable < observations <= usable
         assert session.run("map_size").kinds[0].rows == len(vi_map.keypoints)
 

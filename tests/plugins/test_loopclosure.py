@@ -13,8 +13,7 @@ from maplab_plugins.visualization.following import Following
 
 from maplab_py.algorithms.cloud_registration import registration
 from maplab_py.algorithms.landmarks.quality import LandmarkExplanation
-from maplab_py.algorithms.loop_closure import explanation
-from maplab_py.algorithms.loop_closure.closure_record import read_record
+from maplab_py.algorithms.loop_closure import closure_record, explanation
 from maplab_py.console.prompt.completion import complete
 from maplab_py.console.session.session import Session
 from maplab_py.console.terminal.render import rendered
@@ -115,7 +114,7 @@ def test_a_person_accepts_and_refuses_closures() -> None:
     report = session.run("judge_closures", accept=ids[0], refuse=f"{ids[1]}, {ids[2]}")
     assert (report.accepted, report.refused, report.edges_added) == ((ids[0],), (ids[1], ids[2]), 1)
     (edge,) = session.vi_map.loop_closure_edges.T_A_B
-    closures = read_record(session.vi_map).closures
+    closures = closure_record.read_record(session.vi_map).closures
     assert np.array_equal(edge, closures.T_A_B[[to_hex(i)[:8] for i in closures.id].index(ids[0])])
     verdicts = {line.id: line.verdict for line in session.run("lc_report", which="all").closures}
     assert [verdicts[i] for i in ids[:3]] == ["accepted", "removed by hand", "removed by hand"]
@@ -152,7 +151,7 @@ def test_verdicts_of_the_page_are_applied() -> None:
     viewer.court.judge(False, page)
     report = session.run("judge_closures")
     assert (len(report.accepted), len(report.refused)) == (1, 1)
-    name = to_hex(read_record(session.vi_map).closures.id[first.row])[:8]
+    name = to_hex(closure_record.read_record(session.vi_map).closures.id[first.row])[:8]
     assert report.accepted == (name,)
     session.run("viewer_stop")
 
@@ -270,7 +269,7 @@ def closed_rooms() -> Session:
 
 
 def test_the_argument_is_resolved(closed_rooms: Session) -> None:
-    closure = to_hex(read_record(closed_rooms.vi_map).closures.id[0])[:8]
+    closure = to_hex(closure_record.read_record(closed_rooms.vi_map).closures.id[0])[:8]
     landmark = to_hex(closed_rooms.vi_map.landmarks.id[3])
     assert isinstance(closed_rooms.run("why", closure), explanation.ClosureExplanation)
     assert isinstance(closed_rooms.run("why", "monday"), explanation.MissionExplanation)
@@ -280,7 +279,7 @@ def test_the_argument_is_resolved(closed_rooms: Session) -> None:
 
 
 def test_flags_show_what_they_would_decide(closed_rooms: Session) -> None:
-    closure = to_hex(read_record(closed_rooms.vi_map).closures.id[0])[:8]
+    closure = to_hex(closure_record.read_record(closed_rooms.vi_map).closures.id[0])[:8]
     strict = closed_rooms.run("why", closure, lc_min_inlier_count=1000)
     assert [line["flag"] for line in strict.as_dict()["gates"] if line["result"] == "failed"] == [
         "--lc_min_inlier_count"

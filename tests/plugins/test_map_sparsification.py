@@ -7,8 +7,7 @@ import pytest
 
 from maplab_py.console.session.session import Session
 from maplab_py.errors import UserError
-from maplab_py.vimap.consistency import check_consistency
-from maplab_py.vimap.edits import remove_landmarks
+from maplab_py.vimap import consistency, edits
 from tests.vimap.builders import walk_map
 
 
@@ -26,7 +25,7 @@ def test_a_dry_run_says_what_keyframing_then_does(session: Session) -> None:
     assert session.vi_map is before
     done = session.run("kfh", **flags)
     assert len(session.vi_map.vertices) == done.vertices_after == planned.vertices_after < 12
-    assert check_consistency(session.vi_map).errors == ()
+    assert consistency.check_consistency(session.vi_map).errors == ()
 
 
 def test_sparsification_keeps_as_many_as_it_is_told(session: Session, tmp_path: Path) -> None:
@@ -37,7 +36,7 @@ def test_sparsification_keeps_as_many_as_it_is_told(session: Session, tmp_path: 
     assert not table.exists()
     done = session.run("landmark_sparsify", num_landmarks_to_keep=15, coverage_csv=table)
     assert len(session.vi_map.landmarks) == 15 == planned.landmarks_after == done.landmarks_after
-    assert check_consistency(session.vi_map).errors == ()
+    assert consistency.check_consistency(session.vi_map).errors == ()
     header, *lines = table.read_text().splitlines()
     assert header == "vertex,before,after,wanted"
     assert len(lines) == done.keyframes
@@ -66,7 +65,7 @@ def test_triangulation_and_tracks(session: Session) -> None:
     report = session.run("rtl")
     assert report.triangulated + report.too_few_observations == report.landmarks
     m = session.vi_map
-    session.maps.add("bare", remove_landmarks(m, np.ones(len(m.landmarks), dtype=bool)))
+    session.maps.add("bare", edits.remove_landmarks(m, np.ones(len(m.landmarks), dtype=bool)))
     session.run("select", map_key="bare")
     added = session.run("itl")
     assert added.landmarks_added == len(session.vi_map.landmarks) == report.triangulated

@@ -14,8 +14,7 @@ from maplab_py.frontend.mapping import Mapping
 from maplab_py.frontend.reports import MappingReport
 from maplab_py.simulation.scenario import MotionOptions
 from maplab_py.storage.native import SaveReport, load_map, save_map
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.consistency import check_consistency
+from maplab_py.vimap import VIMap, consistency
 from tests.frontend.simulated import replayed
 from tests.interop.recordings.written import make_content, write_folder
 from tests.support.data import shared_data
@@ -51,7 +50,7 @@ def test_the_map_is_saved_and_selected(walk: Path, tmp_path: Path) -> None:
         assert session.maps.selected.is_saved
         assert session.maps.selected.folder == target
         vi_map, _ = load_map(target)
-        assert check_consistency(vi_map).failure == ""
+        assert consistency.check_consistency(vi_map).failure == ""
         assert len(vi_map.vertices) == len(session.vi_map.vertices) == report.vertices > 50
         assert list(session.vi_map.missions.name) == ["map"]
         assert len(report.starts) == 1
@@ -77,7 +76,7 @@ def test_the_other_commands_take_the_map(walk: Path, tmp_path: Path) -> None:
         assert session.run("optvi").failure == ""
         assert session.run("elq").failure == ""
         session.run("save", map_folder=tmp_path / "map")
-        assert check_consistency(load_map(tmp_path / "map")[0]).failure == ""
+        assert consistency.check_consistency(load_map(tmp_path / "map")[0]).failure == ""
 
 
 @pytest.mark.slow
@@ -190,7 +189,7 @@ def test_ctrl_c_ends_the_recording_and_keeps_the_map(
         assert session.maps.selected_key == "part"
         assert len(session.vi_map.vertices) == report.vertices > 20
         assert session.maps.selected.is_saved == is_saved
-        assert check_consistency(session.vi_map).failure == ""
+        assert consistency.check_consistency(session.vi_map).failure == ""
         session.run("save", map_folder=tmp_path / "saved_later")
     for name in ("saved_later", *(["map"] if is_saved else [])):
         assert len(load_map(tmp_path / name)[0].vertices) == report.vertices
@@ -316,7 +315,7 @@ def test_real_images(tmp_path: Path, cameras: str, bar_m: float) -> None:
         assert evaluated.ape_m.rmse <= bar_m
         images = list((tmp_path / "map" / "resources" / "raw_images").iterdir())
         assert len(images) == report.vertices * (1 if cameras else 2)
-        assert check_consistency(load_map(tmp_path / "map")[0]).failure == ""
+        assert consistency.check_consistency(load_map(tmp_path / "map")[0]).failure == ""
         assert np.all(session.vi_map.binary_descriptor_size == 64)
 
 

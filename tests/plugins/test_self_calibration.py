@@ -17,8 +17,7 @@ from maplab_py.algorithms.self_calibration.segments import database as database_
 from maplab_py.console.scripts.runner import Runner
 from maplab_py.console.session.session import Session
 from maplab_py.console.session.status import Status
-from maplab_py.console.terminal.foreground import SECONDS_OF_GRACE
-from maplab_py.console.terminal.output import ConsoleTerminal
+from maplab_py.console.terminal import foreground, output
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.sensors.sensors_yaml import read_sensors
 from maplab_py.storage.native import save_map
@@ -69,7 +68,7 @@ def test_ctrl_c_leaves_no_thread_that_writes_the_database(
         def call(*words: Any, **flags: Any) -> Any:
             result = function(*words, **flags) if moment == "calibrated" else None
             os.kill(os.getpid(), signal.SIGINT)
-            time.sleep(3.0 * SECONDS_OF_GRACE)
+            time.sleep(3.0 * foreground.SECONDS_OF_GRACE)
             return function(*words, **flags) if moment == "saving" else result
 
         return call
@@ -79,7 +78,7 @@ def test_ctrl_c_leaves_no_thread_that_writes_the_database(
         (database_file, "save_database")
     )  # fmt: skip
     monkeypatch.setattr(module, name, interrupted(getattr(module, name)))
-    session.terminal = terminal = ConsoleTerminal()
+    session.terminal = terminal = output.ConsoleTerminal()
     runner = Runner(session, terminal)
     flags = " ".join(f"--{name}={value}" for name, value in FLAGS.items())
     before = session.vi_map

@@ -12,8 +12,7 @@ from maplab_py.errors import MapError, UserError
 from maplab_py.report import Message
 from maplab_py.storage.mission_names import named
 from maplab_py.storage.native import load_map, save_map
-from maplab_py.vimap import NO_ROW, ResourceOwner, Resources, VIMap
-from maplab_py.vimap.comparison import is_same
+from maplab_py.vimap import NO_ROW, ResourceOwner, Resources, VIMap, comparison
 from tests.console.sample_plugin import map_of
 from tests.vimap.builders import walk_map
 
@@ -38,7 +37,7 @@ def test_load_selects_the_map_under_its_folders_name(
     session.run("load", map_folder=tmp_path / "walk_0")
     assert session.maps.keys == ["walk_0"]
     assert list(session.vi_map.missions.name) == ["walk_0"]
-    assert is_same(named(session.vi_map, [""]), disk[tmp_path / "walk_0"])
+    assert comparison.is_same(named(session.vi_map, [""]), disk[tmp_path / "walk_0"])
     assert session.maps.selected.is_saved
     with pytest.raises(UserError, match="'walk_0' is in use"):
         session.run("load", map_folder=tmp_path / "walk_0")
@@ -97,7 +96,7 @@ def test_save_needs_a_folder_and_overwrite(
     with pytest.raises(UserError, match="has no folder yet"):
         session.run("save")
     session.run("save", map_folder=tmp_path / "out")
-    assert is_same(session.vi_map.missions, load_map(tmp_path / "out")[0].missions)
+    assert comparison.is_same(session.vi_map.missions, load_map(tmp_path / "out")[0].missions)
     assert session.maps.selected.is_saved
     with pytest.raises(UserError, match="use --overwrite"):
         session.run("save", map_folder=tmp_path / "walk_0")

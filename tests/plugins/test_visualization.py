@@ -15,9 +15,8 @@ from maplab_py.interop.ply import PlyCloud, parse_ply, write_ply
 from maplab_py.interop.trajectories import Trajectory, write_tum
 from maplab_py.storage.resources.store import relative_path
 from maplab_py.storage.resources.types import RESOURCE_TYPES
+from maplab_py.viewer import picking, scene
 from maplab_py.viewer.display.viewer import Viewer
-from maplab_py.viewer.picking import Pick
-from maplab_py.viewer.scene import Entity
 from maplab_py.vimap import ResourceOwner, Resources, VIMap, random_ids, to_hex
 from tests.vimap.builders import T_I_C, walk_map
 
@@ -97,9 +96,9 @@ def test_a_pick_is_a_variable_of_the_prompt(session: Session) -> None:
     name = to_hex(vi_map.landmarks.id[4])
     assert name[:8] in session.run("viewer_go_to", name[:12]).text
     assert viewer.selection.picked is not None
-    assert viewer.selection.picked.entity is Entity.LANDMARK
+    assert viewer.selection.picked.entity is scene.Entity.LANDMARK
     assert session.variables["pick"] == name
-    viewer.select(Pick(Entity.VERTEX, 3, vi_map.T_G_I[3, 4:], 0.0))  # as a click does
+    viewer.select(picking.Pick(scene.Entity.VERTEX, 3, vi_map.T_G_I[3, 4:], 0.0))  # as a click does
     vertex = to_hex(vi_map.vertices.id[3])
     assert session.variables["pick"] == vertex
     with pytest.raises(UserError, match="no vertex, landmark"):

@@ -10,8 +10,7 @@ from maplab_py.errors import EstimationError
 from maplab_py.estimation.blocks import ParameterBlocks
 from maplab_py.estimation.terms.cameras import EXTRINSICS, INTRINSICS
 from maplab_py.geometry import se3
-from maplab_py.research import joint_ekf
-from maplab_py.research.ekf_tracks import linearised, tracks_of
+from maplab_py.research import ekf_tracks, joint_ekf
 from maplab_py.sensors.sensor_set import Sensor
 from maplab_py.vimap import VIMap
 from tests.algorithms.self_calibration.scenes import OPTIONS, device, nominal, scene_map
@@ -83,17 +82,17 @@ def test_errors_are_about_as_large_as_announced() -> None:
 def test_derivatives_of_tracks() -> None:
     vi_map = scene_map(vertices=21)
     _, rig = device(vi_map)
-    tracks = tracks_of(vi_map, np.arange(21), rig.cameras, joint_ekf.WINDOW)
+    tracks = ekf_tracks.tracks_of(vi_map, np.arange(21), rig.cameras, joint_ekf.WINDOW)
     T_G_I, T_I_C = vi_map.T_G_I, rig.T_B_C
     chosen = np.arange(min(5, len(tracks.camera)))
-    at = linearised(tracks, chosen, T_G_I, T_I_C, T_G_I)
+    at = ekf_tracks.linearised(tracks, chosen, T_G_I, T_I_C, T_G_I)
     assert np.abs(at.residual).max() <= 1e-6
     # what points take up cannot be seen: compare after projecting on what they cannot
     step = 1e-6
     for column in range(6):
         delta = np.zeros((1, 6))
         delta[0, column] = step
-        moved = linearised(tracks, chosen, T_G_I, se3.retract(T_I_C, delta), T_G_I)
+        moved = ekf_tracks.linearised(tracks, chosen, T_G_I, se3.retract(T_I_C, delta), T_G_I)
         for one in range(len(chosen)):
             own = at.track == one
             points = at.by_point[own].reshape(-1, 3)

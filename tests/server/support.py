@@ -20,8 +20,7 @@ from maplab_py.server.spool import Spool, push
 from maplab_py.server.worker import SubmapOrder
 from maplab_py.simulation.scenario import MeasurementOptions, Scenario, SessionOptions, WorldOptions
 from maplab_py.storage.native import load_map, save_map
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.excerpts import cut_by_time
+from maplab_py.vimap import VIMap, excerpts
 from tests.simulation.small import simulated
 
 TWO_ROBOTS = Scenario(
@@ -62,7 +61,7 @@ Execute = Callable[[SubmapOrder, Callable[[], bool]], Outcome]
 
 def submaps(robot: str) -> list[VIMap]:
     """Return the three submaps of a robot."""
-    return cut_by_time(simulated(TWO_ROBOTS).maps[ROBOTS.index(robot)], 3.0)
+    return excerpts.cut_by_time(simulated(TWO_ROBOTS).maps[ROBOTS.index(robot)], 3.0)
 
 
 def session(robot: str) -> VIMap:

@@ -12,12 +12,10 @@ import pytest
 from maplab_py.errors import UserError
 from maplab_py.pipeline.messages import Ending, Outcome
 from maplab_py.sensors import SensorSet
-from maplab_py.server.publishing import Publisher
+from maplab_py.server import publishing, worker
 from maplab_py.server.spool import Arrival, Entry, Spool, push
-from maplab_py.server.worker import SubmapOrder
 from maplab_py.storage.native import save_map
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.edits import with_new_ids
+from maplab_py.vimap import VIMap, edits
 from tests.server.support import ROBOTS, Servers, copying, submaps
 
 
@@ -69,7 +67,7 @@ def test_a_clock_that_jumps(servers: Servers) -> None:
 def test_a_stretch_of_time_that_the_map_has_with_other_vertices(servers: Servers) -> None:
     servers.put("ant", 0)
     servers.run()
-    other = with_new_ids(submaps("ant")[0])
+    other = edits.with_new_ids(submaps("ant")[0])
     same_mission = other.replace(missions=other.missions.replace(id=submaps("ant")[0].missions.id))
     servers.put("ant", 1, same_mission, "again")
     servers.run()
@@ -128,15 +126,15 @@ def test_a_full_disk_delays_the_map_and_loses_nothing(
     servers: Servers, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("maplab_py.server.server._SECONDS_BETWEEN_RETRIES", 0.1)
-    publish, failures = Publisher.publish, [1, 2]
+    publish, failures = publishing.Publisher.publish, [1, 2]
 
-    def full(publisher: Publisher, vi_map: VIMap, *, compress: bool) -> None:
+    def full(publisher: publishing.Publisher, vi_map: VIMap, *, compress: bool) -> None:
         if failures:
             failures.pop()
             raise UserError("city: cannot be saved (No space left on device)")
         publish(publisher, vi_map, compress=compress)
 
-    monkeypatch.setattr(Publisher, "publish", full)
+    monkeypatch.setattr(publishing.Publisher, "publish", full)
     for number in range(3):
         servers.put("ant", number)
     server = servers.run()
@@ -170,7 +168,7 @@ def test_a_full_disk_is_said_once_for_each_submap_that_it_stops(
     monkeypatch.setattr("maplab_py.server.preparation._SECONDS_BETWEEN_RETRIES", 0.1)
     attempts: Counter[str] = Counter()
 
-    def full(order: SubmapOrder, is_cancelled: Callable[[], bool]) -> Outcome:
+    def full(order: worker.SubmapOrder, is_cancelled: Callable[[], bool]) -> Outcome:
         attempts[order.title] += 1
         if attempts[order.title] <= 4:
             error = f".worker.{len(attempts)}: cannot be saved (No space left on device)"
@@ -193,7 +191,7 @@ def test_a_full_disk_is_said_once_for_each_submap_that_it_stops(
 def test_a_killed_worker_costs_an_attempt(servers: Servers) -> None:
     killed: list[str] = []
 
-    def dying(order: SubmapOrder, is_cancelled: Callable[[], bool]) -> Outcome:
+    def dying(order: worker.SubmapOrder, is_cancelled: Callable[[], bool]) -> Outcome:
         if not killed:
             killed.append(order.title)
             return Outcome(order.title, Ending.OVER_MEMORY, "was killed")
@@ -220,7 +218,7 @@ def test_a_failure_that_is_not_the_submap_s_is_tried_again(
     monkeypatch.setattr("maplab_py.server.preparation._SECONDS_BETWEEN_RETRIES", 0.1)
     failed: list[str] = []
 
-    def failing(order: SubmapOrder, is_cancelled: Callable[[], bool]) -> Outcome:
+    def failing(order: worker.SubmapOrder, is_cancelled: Callable[[], bool]) -> Outcome:
         if not failed:
             failed.append(order.title)
             return Outcome(order.title, ending, error)

@@ -11,15 +11,13 @@ from maplab_py.algorithms.cloud_registration import registration
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
 from maplab_py.algorithms.landmarks.quality import evaluate_quality
 from maplab_py.errors import UserError
-from maplab_py.server import merging
+from maplab_py.server import merging, publishing
 from maplab_py.server.alignments import OpenAlignments
 from maplab_py.server.merging import Merger, stretches_of
 from maplab_py.server.options import IncrementalOptions, MergingOptions
-from maplab_py.server.publishing import Display
 from maplab_py.simulation.evaluation import evaluate_map
 from maplab_py.simulation.scenario import SessionOptions
-from maplab_py.vimap import VIMap, without_resources
-from maplab_py.vimap.merge import merge_maps
+from maplab_py.vimap import VIMap, merge, without_resources
 from tests.algorithms.cloud_registration.test_registration import ROOM, session
 from tests.server.support import TWO_ROBOTS
 from tests.simulation.small import simulated
@@ -30,7 +28,7 @@ OFF_M = 1.5
 def map_with_a_gap(off_m: float) -> VIMap:
     """Return both robots in their true frames, the second one off by a distance."""
     data = simulated(TWO_ROBOTS)
-    vi_map, _ = merge_maps(*data.maps)
+    vi_map, _ = merge.merge_maps(*data.maps)
     rows = [
         int(np.flatnonzero((data.truth.mission_id == id_).all(axis=1))[0])
         for id_ in vi_map.missions.id
@@ -147,7 +145,7 @@ MAPS = [VIMap() for _ in range(4)]
 
 def test_every_map_is_shown_without_an_interval() -> None:
     seen: list[VIMap] = []
-    display = Display(seen.append, 0.0)
+    display = publishing.Display(seen.append, 0.0)
     for vi_map in MAPS:
         display.offer(vi_map)
     assert all(a is b for a, b in zip(seen, MAPS, strict=True))
@@ -159,7 +157,7 @@ def test_the_latest_map_is_shown_when_its_time_has_come(monkeypatch: pytest.Monk
     now = [100.0]
     monkeypatch.setattr("maplab_py.server.publishing.time.monotonic", lambda: now[0])
     seen: list[VIMap] = []
-    display = Display(seen.append, 10.0)
+    display = publishing.Display(seen.append, 10.0)
     display.offer(MAPS[0])
     display.offer(MAPS[1])
     display.offer(MAPS[2])
@@ -177,7 +175,7 @@ def test_the_latest_map_is_shown_when_its_time_has_come(monkeypatch: pytest.Monk
 
 def test_a_deleted_map_is_not_shown() -> None:
     seen: list[VIMap] = []
-    display = Display(seen.append, 0.0)
+    display = publishing.Display(seen.append, 0.0)
     display.offer(None)
-    Display(None, 0.0).offer(MAPS[0])
+    publishing.Display(None, 0.0).offer(MAPS[0])
     assert seen == []

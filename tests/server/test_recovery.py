@@ -14,12 +14,9 @@ import pytest
 
 from maplab_py.errors import UserError
 from maplab_py.pipeline.messages import Outcome
+from maplab_py.server import merging, publishing, status, worker
 from maplab_py.server.journal import Journal, MergedSubmap, read_journal, write_journal
-from maplab_py.server.merging import Stretch
-from maplab_py.server.publishing import Publisher
 from maplab_py.server.spool import Spool
-from maplab_py.server.status import status_without_server
-from maplab_py.server.worker import SubmapOrder
 from tests.server.support import ROBOTS, Servers, copying, submaps
 from tests.support.waiting import wait_until
 
@@ -30,8 +27,8 @@ from tests.support.waiting import wait_until
     [
         ("os", "rename", 1),  # accept, of the first
         ("os", "rename", 3),  # accept or finish
-        (Publisher, "publish", 1),
-        (Publisher, "publish", 2),
+        (publishing.Publisher, "publish", 1),
+        (publishing.Publisher, "publish", 2),
         ("maplab_py.server.server", "write_journal", 2),  # the first is that of the start
         (Spool, "finish", 1),
         (Spool, "finish", 2),
@@ -59,7 +56,7 @@ def test_what_a_worker_has_made_is_used_after_a_kill(
     servers: Servers, what: str, times: int
 ) -> None:
     servers.put("ant", 0)
-    servers.run_until_killed(Publisher, "publish", 1, after=False)
+    servers.run_until_killed(publishing.Publisher, "publish", 1, after=False)
     prepared = servers.spool.accepted / "000001" / "prepared"
     assert prepared.is_dir()
     if what == "flags":
@@ -72,7 +69,7 @@ def test_what_a_worker_has_made_is_used_after_a_kill(
         shutil.rmtree(prepared)
     calls = []
 
-    def counted(order: SubmapOrder, is_cancelled: Callable[[], bool]) -> Outcome:
+    def counted(order: worker.SubmapOrder, is_cancelled: Callable[[], bool]) -> Outcome:
         calls.append(order.title)
         return copying(order, is_cancelled)
 
@@ -130,7 +127,7 @@ def test_a_lost_journal_is_written_again(servers: Servers) -> None:
 
 
 def test_a_journal_comes_back_as_it_was_and_a_damaged_one_is_named(tmp_path: Path) -> None:
-    stretch = Stretch("59f0", 1, 2)
+    stretch = merging.Stretch("59f0", 1, 2)
     journal = Journal().with_merged(MergedSubmap(7, "ant", "s", "abc", (stretch,)))
     path = tmp_path / "journal.json"
     assert read_journal(path) == Journal()
@@ -150,7 +147,7 @@ def test_a_killed_process_is_followed_by_one_that_goes_on(
     spool = servers.spool
     servers.put("ant", 0)
     first = start(servers, stop_when_idle_s=0)
-    assert wait_until(lambda: status_without_server(spool).merged == 1, 120.0)
+    assert wait_until(lambda: status.status_without_server(spool).merged == 1, 120.0)
     servers.put("ant", 1)
     assert wait_until(lambda: not spool.arrivals(), 60.0)
     first.send_signal(signal.SIGKILL)

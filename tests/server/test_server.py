@@ -14,15 +14,13 @@ import pytest
 from maplab_py.errors import UserError
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Message
+from maplab_py.server import journal, merging
 from maplab_py.server.client import NotRunning, ask, order
-from maplab_py.server.journal import read_journal
-from maplab_py.server.merging import Merger
 from maplab_py.server.options import IncrementalOptions, ServiceOptions
 from maplab_py.server.server import MapServer
 from maplab_py.server.service import Service
 from maplab_py.server.status import status_without_server
-from maplab_py.vimap.consistency import check_consistency
-from maplab_py.vimap.ids import to_hex
+from maplab_py.vimap import consistency, ids
 from tests.server.support import ROBOTS, Servers, session, submaps
 from tests.support.waiting import wait_until
 
@@ -57,7 +55,7 @@ def test_submaps_of_two_robots_become_one_map(servers: Servers) -> None:
     server = servers.run()
     servers.check_whole(*ROBOTS)
     vi_map = servers.published()
-    assert check_consistency(vi_map).errors == ()
+    assert consistency.check_consistency(vi_map).errors == ()
     assert sorted(vi_map.missions.name) == list(ROBOTS)
     known = vi_map.baseframes.is_known[vi_map.missions.baseframe]
     assert known.tolist() == [True, False]
@@ -102,13 +100,13 @@ def test_merged_submaps_are_published_before_a_joint_optimisation(
 ) -> None:
     servers.incremental = IncrementalOptions(full_optimization_every_nth=2)
     published: list[int] = []
-    optimize_jointly = Merger.optimize_jointly
+    optimize_jointly = merging.Merger.optimize_jointly
 
-    def noted(merger: Merger, *, progress: Progress = SILENT) -> float:
+    def noted(merger: merging.Merger, *, progress: Progress = SILENT) -> float:
         published.append(len(servers.published().vertices))
         return optimize_jointly(merger, progress=progress)
 
-    monkeypatch.setattr(Merger, "optimize_jointly", noted)
+    monkeypatch.setattr(merging.Merger, "optimize_jointly", noted)
     for number in range(3):
         servers.put("ant", number)
     servers.run()
@@ -129,7 +127,7 @@ def test_without_saving_at_the_end_a_later_server_goes_on(
     assert report.joint_optimizations == 0
     published = servers.published()
     assert len(published.vertices) == len(submaps("ant")[0].vertices)
-    assert len(read_journal(servers.spool.journal).merged) == 1
+    assert len(journal.read_journal(servers.spool.journal).merged) == 1
     servers.service = ServiceOptions(stop_when_idle_s=0.5)
     server = servers.run()
     servers.check_whole("ant")
@@ -192,7 +190,7 @@ def test_a_deleted_mission_stays_deleted_and_its_submaps_are_refused(servers: Se
     servers.put("ant", 0)
     servers.put("bee", 0)
     assert wait_until(lambda: ask(servers.spool, "serve_status")["merged"] == 2)
-    mission = to_hex(session("bee").missions.id[0])
+    mission = ids.to_hex(session("bee").missions.id[0])
     answer = order(servers.spool, "delete_mission", mission=mission)
     assert answer["missions"] == [mission]
     assert len(servers.published().missions) == 1

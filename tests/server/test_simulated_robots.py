@@ -10,21 +10,17 @@ import pytest
 
 from maplab_py.console.session.session import Session
 from maplab_py.errors import MapError, UserError
-from maplab_py.frontend.data_source import open_source
+from maplab_py.frontend import data_source, run_options
 from maplab_py.frontend.mapping import Mapping
-from maplab_py.frontend.run_options import DataSourceOptions, RunOptions
 from maplab_py.interop.ply import PlyCloud, write_ply
 from maplab_py.interop.recordings.options import SourceOptions
+from maplab_py.server import service, submap_sources
 from maplab_py.server.options import SubmapOutput
-from maplab_py.server.service import dense_points_in_range, map_lookup
-from maplab_py.server.submap_sources import SubmapWriter, recorded_sessions, timed_submaps
 from maplab_py.storage.mission_names import named
 from maplab_py.storage.native import find_maps, load_map, save_map
 from maplab_py.storage.resources.new import NewResources
 from maplab_py.storage.resources.store import existing_files
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.consistency import check_consistency
-from maplab_py.vimap.merge import merge_maps
+from maplab_py.vimap import VIMap, consistency, merge
 from tests.frontend.simulated import REST_FIRST, replayed
 from tests.server.support import ROBOTS, Servers, session
 from tests.support.submaps import append_submaps
@@ -58,20 +54,20 @@ def test_a_server_merges_recordings_under_the_names_of_their_maps(servers: Serve
     servers.check_whole(*ROBOTS)
     vi_map = servers.published()
     assert sorted(vi_map.missions.name) == list(ROBOTS)
-    assert check_consistency(vi_map).errors == ()
+    assert consistency.check_consistency(vi_map).errors == ()
 
 
 def test_robots_are_named_after_their_missions_and_no_name_comes_twice(tmp_path: Path) -> None:
-    both, _ = merge_maps(*(session(robot) for robot in ROBOTS))
+    both, _ = merge.merge_maps(*(session(robot) for robot in ROBOTS))
     save_map(named(both, ["a/b", "..ant"]), tmp_path / "ant")
     save_map(session("bee"), tmp_path / "below" / "ant")
-    names = [*recorded_sessions(tmp_path)]
+    names = [*submap_sources.recorded_sessions(tmp_path)]
     assert names == ["a_b", "ant", "ant_2"]
 
 
 def test_a_folder_without_maps_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="there is no map in it or below it"):
-        recorded_sessions(tmp_path)
+        submap_sources.recorded_sessions(tmp_path)
 
 
 def with_a_cloud(vi_map: VIMap, scratch: Path) -> VIMap:
@@ -100,22 +96,22 @@ def test_resources_of_recordings_come_along_and_the_server_finds_them(servers: S
         np.flatnonzero(published.baseframes.is_known[published.missions.baseframe[mission]])[0]
     )
     center_G = published.T_G_I[published.frames.vertex[published.resources.owner[known]], 4:]
-    points, clouds = dense_points_in_range(
+    points, clouds = service.dense_points_in_range(
         published, servers.map_folder, _POINT_CLOUD, center_G, 2.0
     )
     assert (len(points), clouds) == (2, 1)
     frames = published.baseframes
     unknown = published.replace(baseframes=frames.replace(is_known=np.zeros_like(frames.is_known)))
     with pytest.raises(UserError, match="all of missions that are not anchored yet"):
-        dense_points_in_range(unknown, servers.map_folder, _POINT_CLOUD, center_G, 2.0)
+        service.dense_points_in_range(unknown, servers.map_folder, _POINT_CLOUD, center_G, 2.0)
     with pytest.raises(UserError, match="no resources of type"):
-        dense_points_in_range(published, servers.map_folder, 8, center_G, 2.0)
+        service.dense_points_in_range(published, servers.map_folder, 8, center_G, 2.0)
     first, last = published.vertices.timestamp_ns[published.vertices.mission == 0][[0, -1]]
     with pytest.raises(UserError, match=f"then, but from {first} to {last} ns"):
-        map_lookup(published, published.missions.name[0], last + 1, "", np.zeros(3))
+        service.map_lookup(published, published.missions.name[0], last + 1, "", np.zeros(3))
     shutil.rmtree(maps / "ant" / "resources")
     with pytest.raises(MapError, match="the resource's file is missing"):
-        timed_submaps(recorded_sessions(maps), 3.0)
+        submap_sources.timed_submaps(submap_sources.recorded_sessions(maps), 3.0)
 
 
 def test_the_parts_of_a_recording_join_to_its_map(tmp_path: Path) -> None:
@@ -138,7 +134,7 @@ def test_the_parts_of_a_recording_join_to_its_map(tmp_path: Path) -> None:
     joined, report = append_submaps(parts)
     assert report.vertices_shared == len(parts) - 1
     assert report.landmarks_united > 0
-    assert check_consistency(joined).errors == ()
+    assert consistency.check_consistency(joined).errors == ()
     assert np.array_equal(joined.vertices.timestamp_ns, whole.vertices.timestamp_ns)
     assert len(joined.imu_samples) == len(whole.imu_samples)
     assert len(joined.keypoints) == len(whole.keypoints)
@@ -147,7 +143,7 @@ def test_the_parts_of_a_recording_join_to_its_map(tmp_path: Path) -> None:
 
 
 def test_vertices_of_a_mission_that_was_given_up_are_missing(tmp_path: Path) -> None:
-    writer = SubmapWriter(SubmapOutput(submap_spool=tmp_path / "spool"))
+    writer = submap_sources.SubmapWriter(SubmapOutput(submap_spool=tmp_path / "spool"))
     builder = SimpleNamespace(missions=1, count=lambda mission: 5)
     update = SimpleNamespace(state=object(), time_ns=0)
     writer.after_frame(update, SimpleNamespace(builder=builder))  # type: ignore[arg-type]
@@ -163,11 +159,11 @@ def test_what_was_pushed_leaves_the_memory(tmp_path: Path) -> None:
     parts, left = [], []
     for forgets in (False, True):
         spool = tmp_path / f"spool_{forgets}"
-        recording = open_source(walk, DataSourceOptions(), SourceOptions())
-        writer = SubmapWriter(
+        recording = data_source.open_source(walk, run_options.DataSourceOptions(), SourceOptions())
+        writer = submap_sources.SubmapWriter(
             SubmapOutput(submap_spool=spool, submap_interval_s=3.0), forgets=forgets
         )
-        mapping = Mapping(recording, RunOptions(), observer=writer)
+        mapping = Mapping(recording, run_options.RunOptions(), observer=writer)
         mapping.run()
         writer.finish(mapping)
         assert mapping.builder is not None

@@ -7,8 +7,7 @@ from types import ModuleType
 
 from maplab_py.simulation.scenario import MeasurementOptions, Scenario, SessionOptions, WorldOptions
 from maplab_py.simulation.simulate import SimulatedData, simulate
-from tests.support.data import REPOSITORY
-from tests.support.noiseless import without_noise
+from tests.support import data, noiseless
 
 SMALL = Scenario(
     name="small",
@@ -19,7 +18,7 @@ SMALL = Scenario(
         SessionOptions(kind="figure_8", duration_s=4.0, turns=0.3, start_turn=0.1, reverse=True),
     ),
 )
-PERFECT = dataclasses.replace(without_noise(SMALL), sessions=SMALL.sessions[:1])
+PERFECT = dataclasses.replace(noiseless.without_noise(SMALL), sessions=SMALL.sessions[:1])
 
 
 @cache
@@ -29,7 +28,7 @@ def simulated(scenario: Scenario = SMALL) -> SimulatedData:
 
 def docs_script(name: str) -> ModuleType:
     """Import a script of the documentation."""
-    path = REPOSITORY / "docs" / "scripts" / f"{name}.py"
+    path = data.REPOSITORY / "docs" / "scripts" / f"{name}.py"
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None
     assert spec.loader is not None

@@ -11,16 +11,14 @@ import pytest
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.algorithms.vi_optimization.reports import VIOptimizationReport
-from maplab_py.estimation.imu.inertial_data import InertialData
-from maplab_py.estimation.imu.preintegration import integrate
+from maplab_py.estimation.imu import inertial_data, preintegration
 from maplab_py.geometry import so3
 from maplab_py.sensors import Imu, ImuIntrinsics
 from maplab_py.simulation import scenario as sim
+from maplab_py.simulation import scenario_file, truth
 from maplab_py.simulation.imu import measure
 from maplab_py.simulation.motion import motion_spline
-from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate
-from maplab_py.simulation.truth import true_map
 from tests.simulation.small import PERFECT, SMALL
 
 AT_TRUTH = VIOptimizationOptions(
@@ -46,7 +44,7 @@ DEVIATIONS = sim.CalibrationOptions(
 
 def _report_at_truth(scenario: sim.Scenario) -> VIOptimizationReport:
     data = simulate(scenario)
-    report = optimize(true_map(data.maps[0], data.truth), AT_TRUTH)[1]
+    report = optimize(truth.true_map(data.maps[0], data.truth), AT_TRUTH)[1]
     assert report.observations_not_used == 0
     return report
 
@@ -103,9 +101,9 @@ def test_an_unknown_calibration_is_found_in_the_truth() -> None:
     scenario = dataclasses.replace(PERFECT, calibration=DEVIATIONS)
     data = simulate(scenario)
     stored, _ = data.maps[0], data.truth
-    known = optimize(true_map(stored, data.truth), AT_TRUTH)[1]
+    known = optimize(truth.true_map(stored, data.truth), AT_TRUTH)[1]
     _assert_no_error(known)
-    wrong = true_map(stored, data.truth).replace(sensors=stored.sensors)
+    wrong = truth.true_map(stored, data.truth).replace(sensors=stored.sensors)
     assert optimize(wrong, AT_TRUTH)[1].mean_reprojection_before_px > 1.0
     inertial = {term.term: term.cost_before for term in known.terms}["inertial"]
     skewed = {term.term: term.cost_before for term in optimize(wrong, AT_TRUTH)[1].terms}
@@ -126,7 +124,7 @@ def test_reprojection_errors_have_the_announced_size() -> None:
 
 @pytest.mark.slow
 def test_all_residuals_of_a_long_session_have_the_announced_size() -> None:
-    report = _report_at_truth(_without_swaps(load_scenario("single_session")))
+    report = _report_at_truth(_without_swaps(scenario_file.load_scenario("single_session")))
     chi_square = _chi_square(report)
     assert chi_square["reprojection"] == pytest.approx(1.0, abs=0.02)
     assert chi_square["bias walk"] == pytest.approx(1.0, abs=0.06)
@@ -154,8 +152,8 @@ def test_inertial_errors_have_the_announced_size() -> None:
         gyro_noise_density=options.gyro_noise_density,
     )
     noisy, clean = (
-        integrate(
-            InertialData(
+        preintegration.integrate(
+            inertial_data.InertialData(
                 np.arange(len(first) + 1) * (stride + 1),
                 np.round(rows * 5e6).astype(np.int64),
                 recording.accel_gyro[rows],

@@ -12,8 +12,7 @@ from maplab_py.simulation import scenario as sim
 from maplab_py.simulation.detection import drifts
 from maplab_py.simulation.simulate import SimulatedData, simulate
 from maplab_py.simulation.world import make_world
-from maplab_py.vimap.consistency import check_consistency
-from maplab_py.vimap.tables import FrameField
+from maplab_py.vimap import consistency, tables
 from tests.simulation.small import PERFECT, SMALL
 
 
@@ -35,7 +34,7 @@ def test_drifting_tracks_slide_away() -> None:
     data = _simulate(keypoint_sigma_px=0.5, track_drift_share=0.3, track_drift_px=2.0)
     error = np.linalg.norm(_errors(data), axis=1)
     assert 0.05 < np.mean(error > 4.0) < 0.3
-    assert check_consistency(data.maps[0]).errors == ()
+    assert consistency.check_consistency(data.maps[0]).errors == ()
 
 
 def test_a_drift_begins_on_the_point_and_is_a_random_walk() -> None:
@@ -72,7 +71,7 @@ ROLLING = dataclasses.replace(
 def test_rolling_shutter_shows_each_row_at_its_time() -> None:
     data = simulate(ROLLING)
     vi_map, truth = data.maps[0], data.truth
-    assert np.all(vi_map.frames.present & FrameField.TIME_OFFSET)
+    assert np.all(vi_map.frames.present & tables.FrameField.TIME_OFFSET)
     offset_s = vi_map.keypoints.time_offset_ns[:, 0] * 1e-9
     np.testing.assert_allclose(offset_s, 4e-5 * (vi_map.keypoints.uv_px[:, 1] - 240.0), atol=1e-9)
     # the true motion is known at every IMU sample: interpolate it to the time of each keypoint

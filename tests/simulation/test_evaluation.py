@@ -13,9 +13,7 @@ from maplab_py.simulation.evaluation import MapErrors, evaluate_map
 from maplab_py.simulation.scenario import CalibrationOptions, OtherSensorOptions, SessionOptions
 from maplab_py.simulation.simulate import SimulatedData, simulate
 from maplab_py.simulation.truth import Truth, true_map
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.edits import remove_observations
-from maplab_py.vimap.merge import merge_maps
+from maplab_py.vimap import VIMap, edits, merge
 from tests.simulation.small import PERFECT, SMALL, simulated
 
 CALIBRATION = CalibrationOptions(
@@ -163,7 +161,7 @@ def test_false_loop_edges_are_counted(right: VIMap, data: SimulatedData) -> None
 def test_maps_without_observations_have_no_landmark_error(
     right: VIMap, data: SimulatedData
 ) -> None:
-    bare = remove_observations(right, right.observations)
+    bare = edits.remove_observations(right, right.observations)
     errors = _errors(bare, data)
     assert (errors.landmarks, errors.landmark_median_m) == (0, None)
     assert math.isfinite(errors.ate_m)
@@ -196,7 +194,7 @@ def test_the_frame_of_the_map_does_not_matter(right: VIMap, data: SimulatedData)
 
 def _true_map() -> VIMap:
     """Return the merged map with true poses, in a frame of its own."""
-    merged, _ = merge_maps(*simulated().maps)
+    merged, _ = merge.merge_maps(*simulated().maps)
     truth = simulated().truth
     T_own_G = yaw.to_pose([1.0, -2.0, 0.5, 0.8])
     T_M_I = se3.compose(se3.inverse(truth.T_G_M)[truth.vertex_mission], truth.T_G_I)
@@ -252,7 +250,7 @@ def test_a_misplaced_mission_shows_in_offset_and_yaw_alone() -> None:
 
 
 def test_drift_is_seen_before_anything_is_done() -> None:
-    merged, _ = merge_maps(*simulated().maps)
+    merged, _ = merge.merge_maps(*simulated().maps)
     errors = evaluate_map(merged, simulated().truth)
     assert errors.ate_m > errors.ate_each_m > 0.003
     assert [mission.vertices for mission in errors.missions] == [31, 21]

@@ -12,18 +12,15 @@ import yaml
 from maplab_py.console.session.session import Session
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
-from maplab_py.interop.imu_csv import read_imu_csv
-from maplab_py.interop.trajectories import read_trajectory
-from maplab_py.sensors import Camera, Distortion, Projection
-from maplab_py.sensors.projection import back_project
+from maplab_py.interop import imu_csv, trajectories
+from maplab_py.sensors import Camera, Distortion, Projection, projection
 from maplab_py.simulation import scenario as sim
+from maplab_py.simulation import scenario_file, shading_kernels
 from maplab_py.simulation.cameras import pixels_of
 from maplab_py.simulation.imaging import Brightness, Imager, pixel_rays
 from maplab_py.simulation.raw_data import write_mesh, write_raw_data
 from maplab_py.simulation.ray_caster import RayCaster, painted_boxes
-from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.scene import Scene, make_scene
-from maplab_py.simulation.shading_kernels import PaintedBoxes
 from maplab_py.simulation.simulate import SimulatedData, simulate
 from tests.simulation.slow_renderer import render_slowly
 
@@ -200,7 +197,7 @@ def scene() -> Scene:
 
 
 @cache
-def painted() -> PaintedBoxes:
+def painted() -> shading_kernels.PaintedBoxes:
     return painted_boxes(scene())
 
 
@@ -240,7 +237,7 @@ def test_rays_of_pixels_meet_their_pixels(distortion: Distortion, parameters: li
     v, u = np.nonzero(seen)
     points = np.concatenate([rays[seen], np.ones((len(u), 1))], axis=1)
     np.testing.assert_allclose(pixels_of(camera, points), np.stack([u, v], axis=1), atol=1e-6)
-    expected, valid = back_project(camera, np.stack([u, v], axis=1))
+    expected, valid = projection.back_project(camera, np.stack([u, v], axis=1))
     turned = np.cross(points, expected)[valid] / np.linalg.norm(points[valid], axis=1)[:, None]
     assert np.abs(turned).max() < 1e-7
 
@@ -335,7 +332,7 @@ def test_raw_data_are_euroc_folders(tmp_path: Path) -> None:
     folders = write_raw_data(_raw_scenario(), data, tmp_path)
     assert folders == [tmp_path / "raw" / "session_1"]
     mav = folders[0] / "mav0"
-    imu = read_imu_csv(mav / "imu0" / "data.csv")
+    imu = imu_csv.read_imu_csv(mav / "imu0" / "data.csv")
     np.testing.assert_array_equal(imu.accel_gyro, data.recordings[0].recording.imu.accel_gyro)
     for row in (0, 1):
         lines = (mav / f"cam{row}" / "data.csv").read_text().splitlines()[1:]
@@ -356,7 +353,7 @@ def test_raw_data_are_euroc_folders(tmp_path: Path) -> None:
             np.array(sensor["T_BS"]["data"]).reshape(4, 4), se3.to_matrix(stored.T_B_C[row])
         )
         assert sensor["intrinsics"] == stored.cameras[row].intrinsics.tolist()
-    truth = read_trajectory(tmp_path / "truth" / "session_1" / "ground_truth.csv")
+    truth = trajectories.read_trajectory(tmp_path / "truth" / "session_1" / "ground_truth.csv")
     np.testing.assert_allclose(truth.T_R_B, data.truth.sample_T_G_I)
     with pytest.raises(UserError, match="exists"):
         write_raw_data(_raw_scenario(), data, tmp_path)
@@ -409,6 +406,6 @@ def test_the_command_writes_raw_data_when_asked(tmp_path: Path) -> None:
 
 
 def test_the_scenario_of_images_renders() -> None:
-    scenario = load_scenario("stereo_room")
+    scenario = scenario_file.load_scenario("stereo_room")
     assert scenario.images.render
     assert len(scenario.cameras) == 2

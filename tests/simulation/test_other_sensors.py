@@ -7,13 +7,10 @@ import numpy as np
 import pytest
 
 from maplab_py.errors import UserError
-from maplab_py.geometry import se3, so3
-from maplab_py.geometry.interpolation import interpolate_poses
-from maplab_py.interop.ply import parse_ply
-from maplab_py.interop.wheel_odometry import read_wheel_odometry
+from maplab_py.geometry import interpolation, se3, so3
+from maplab_py.interop import ply, wheel_odometry
+from maplab_py.simulation import raw_data, scenario_file
 from maplab_py.simulation import scenario as sim
-from maplab_py.simulation.raw_data import write_raw_data
-from maplab_py.simulation.scenario_file import check_scenario, load_scenario
 from maplab_py.simulation.simulate import Lidar, SimulatedData, simulate
 from maplab_py.simulation.truth import Truth
 from maplab_py.simulation.world import World, make_world
@@ -113,7 +110,7 @@ def test_too_many_loop_edges_are_refused() -> None:
 
 
 def test_the_scenario_of_false_edges() -> None:
-    data = simulate(load_scenario("false_loop_edges"))
+    data = simulate(scenario_file.load_scenario("false_loop_edges"))
     assert len(data.truth.loop_edge_is_true) == 60
     assert data.truth.loop_edge_is_true.sum() == 40
 
@@ -134,12 +131,12 @@ def test_raw_data_have_the_velocities_of_the_wheels(tmp_path: Path) -> None:
         sessions=(sim.SessionOptions(kind="vehicle", duration_s=8.0, turns=0.2),),
     )
     data = simulate(scenario)
-    (folder,) = write_raw_data(scenario, data, tmp_path)
-    track = read_wheel_odometry(folder / "mav0" / "wheel0" / "data.csv")
+    (folder,) = raw_data.write_raw_data(scenario, data, tmp_path)
+    track = wheel_odometry.read_wheel_odometry(folder / "mav0" / "wheel0" / "data.csv")
     assert track.kind == "velocities"
     edges = data.maps[0].transformation_edges
     stamps = data.maps[0].vertices.timestamp_ns
-    T_O_S, covered = interpolate_poses(track.times_ns, track.T_O_S, stamps)
+    T_O_S, covered = interpolation.interpolate_poses(track.times_ns, track.T_O_S, stamps)
     first = np.flatnonzero(covered[:-1] & covered[1:])
     assert len(first) >= len(edges) - 1
     found = se3.relative(T_O_S[first], T_O_S[first + 1])
@@ -223,7 +220,7 @@ def _check_clouds_against_truth(world: World, vi_map, truth: Truth) -> None:
     )
     T_G_L = se3.compose(truth.sample_T_G_I[row], vi_map.sensors.T_I_S(imu, lidar_id))
     folder = vi_map.metadata.staged_folders[0].path
-    cloud = parse_ply(ResourceStore(vi_map, folder).load(5), "cloud")
+    cloud = ply.parse_ply(ResourceStore(vi_map, folder).load(5), "cloud")
     assert distance_to_surfaces(world, se3.transform(T_G_L, cloud.p)).max() < 0.01
 
 
@@ -238,4 +235,4 @@ def _check_clouds_against_truth(world: World, vi_map, truth: Truth) -> None:
 )
 def test_wrong_options_are_refused(options: sim.LidarOptions, key: str) -> None:
     with pytest.raises(UserError, match=key):
-        check_scenario(sim.Scenario(lidar=options))
+        scenario_file.check_scenario(sim.Scenario(lidar=options))

@@ -9,8 +9,7 @@ import pytest
 
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
-from maplab_py.interop.imu_csv import ImuRecording, read_imu_csv, write_imu_csv
-from maplab_py.interop.trajectories import Trajectory, read_trajectory, write_euroc
+from maplab_py.interop import imu_csv, trajectories
 from maplab_py.simulation.recording import recorded_samples
 from maplab_py.simulation.scenario import SessionOptions, WorldOptions
 from maplab_py.simulation.scenario_file import load_scenario
@@ -34,15 +33,15 @@ def _write_circle(path: Path, *, x_m: float, seconds: float = 8.0, biases: bool 
         bias = np.stack([0.01 * time, 0.0 * time, 0.0 * time], axis=1)
         state = {"v_R": 0.0 * bias, "gyro_bias": bias, "accel_bias": 2.0 * bias}
     times = BEGIN_NS + np.round(time * 1e9).astype(np.int64)
-    write_euroc(Trajectory(times, se3.make(q, p), **state), path)
+    trajectories.write_euroc(trajectories.Trajectory(times, se3.make(q, p), **state), path)
 
 
-def _write_imu(path: Path, *, begin_s: float = -1.0, seconds: float = 12.0) -> ImuRecording:
+def _write_imu(path: Path, *, begin_s: float = -1.0, seconds: float = 12.0) -> imu_csv.ImuRecording:
     time = begin_s + np.arange(int(200 * seconds)) / 200.0
     times = BEGIN_NS + np.round(time * 1e9).astype(np.int64)
     samples = np.random.default_rng(0).normal(size=(len(time), 6))
-    write_imu_csv(ImuRecording(times, samples), path)
-    return ImuRecording(times, samples)
+    imu_csv.write_imu_csv(imu_csv.ImuRecording(times, samples), path)
+    return imu_csv.ImuRecording(times, samples)
 
 
 def _session(folder: Path, name: str = "a.csv", **options: object) -> SessionOptions:
@@ -117,7 +116,7 @@ def test_images_are_taken_where_the_file_says(tmp_path: Path) -> None:
     _write_circle(tmp_path / "a.csv", x_m=0.0)
     _write_imu(tmp_path / "imu.csv")
     recording = _simulated(tmp_path).recordings[0].recording
-    poses = read_trajectory(tmp_path / "a.csv").T_R_B[20:121]
+    poses = trajectories.read_trajectory(tmp_path / "a.csv").T_R_B[20:121]
     np.testing.assert_allclose(
         se3.relative(recording.motion.T_G_I[:1], recording.motion.T_G_I),
         se3.relative(poses[:1], poses),
@@ -173,7 +172,7 @@ def test_the_flights_through_the_vicon_room_share_its_frame(tmp_path: Path) -> N
     files = "V101.gt.csv", "V102.gt.csv"
     data = _example(tmp_path, "vicon_room.yaml", *files)
     starts = [session.recording.imu_motion.T_G_I[0] for session in data.recordings]
-    expected = [read_trajectory(tmp_path / file).T_R_B[0] for file in files]
+    expected = [trajectories.read_trajectory(tmp_path / file).T_R_B[0] for file in files]
     np.testing.assert_allclose(
         starts[1][4:] - starts[0][4:], expected[1][4:] - expected[0][4:], atol=1e-6
     )
@@ -196,7 +195,7 @@ def test_recorded_samples_of_a_flight_agree_with_its_motion(tmp_path: Path) -> N
     turns = so3.log(so3.multiply(so3.inverse(T_G_I[:-1, :4]), T_G_I[1:, :4]))
     assert np.rad2deg(np.abs(turns).max()) > 1.0
     assert np.rad2deg(np.std(felt - turns[:240])) < 0.02
-    expected = read_imu_csv(tmp_path / "V101.imu.csv").accel_gyro[: len(rate)]
+    expected = imu_csv.read_imu_csv(tmp_path / "V101.imu.csv").accel_gyro[: len(rate)]
     np.testing.assert_array_equal(recording.imu.accel_gyro, expected)
 
 
@@ -210,7 +209,7 @@ def test_a_handheld_walk_of_tum_vi() -> None:
     path = shared_data("tumvi_imu/room4.gt.csv")
     options = SessionOptions(trajectory=str(path), duration_s=60.0, keep_frame=True)
     spline = trajectory_spline(options, ROOM, (options,))
-    truth = read_trajectory(path)
+    truth = trajectories.read_trajectory(path)
     moved = spline.evaluate(np.arange(0.0, 60.0, 0.1)).T_G_I
     # the pose of the file 30 s later lies within 5 ms of one that the spline meets
     row = int(np.searchsorted(truth.times_ns, truth.times_ns[0] + 30_000_000_000))

@@ -10,15 +10,10 @@ import pytest
 
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3
-from maplab_py.interop.recordings.protocol import FrameSet, ImuBatch
-from maplab_py.interop.recordings.reader_choice import open_recording
-from maplab_py.interop.recordings.stream import EventStream
+from maplab_py.interop.recordings import protocol, reader_choice, stream
 from maplab_py.interop.trajectories import read_trajectory
+from maplab_py.simulation import imaging, raw_data, ray_caster, scenario_file
 from maplab_py.simulation import scenario as sim
-from maplab_py.simulation.imaging import Brightness, make_brightness
-from maplab_py.simulation.raw_data import SessionFolders, write_images, write_raw_data
-from maplab_py.simulation.ray_caster import painted_boxes
-from maplab_py.simulation.scenario_file import load_scenario, parse_scenario, scenario_names
 from maplab_py.simulation.scene import Scene, make_scene
 from maplab_py.simulation.simulate import SimulatedData, simulate
 
@@ -56,7 +51,7 @@ def _first_images(folder: Path, **images: float) -> list[np.ndarray]:
         images=sim.SessionImages(**images),  # type: ignore[arg-type]
     )
     scenario = dataclasses.replace(FLIGHT, sessions=(session,))
-    write_raw_data(scenario, data(), folder)
+    raw_data.write_raw_data(scenario, data(), folder)
     files = sorted((folder / "raw" / "session_1" / "mav0" / "cam0" / "data").iterdir())
     return [cv2.imread(str(file), cv2.IMREAD_UNCHANGED).astype(float) for file in files]
 
@@ -73,7 +68,7 @@ def test_light_multiplies_grey_values(tmp_path: Path) -> None:
 
 def test_the_gain_jumps_at_random_times_and_stays_in_between() -> None:
     options = sim.SessionImages(gain_jump=0.4, gain_jump_every_s=2.0)
-    brightness = make_brightness(options, 0.0, 400.0, np.random.default_rng(3))
+    brightness = imaging.make_brightness(options, 0.0, 400.0, np.random.default_rng(3))
     assert 150 < len(brightness.jump_s) < 250
     times = np.linspace(0.0, 400.0, 20_001)
     gain = np.array([brightness.at(time) for time in times])
@@ -84,14 +79,14 @@ def test_the_gain_jumps_at_random_times_and_stays_in_between() -> None:
 
 
 def test_both_cameras_have_the_same_gain_at_a_time() -> None:
-    brightness = Brightness(0.5, 0.1, np.array([1.0]), np.array([1.0, 1.2]))
+    brightness = imaging.Brightness(0.5, 0.1, np.array([1.0]), np.array([1.0, 1.2]))
     assert brightness.at(0.5) == pytest.approx(0.5 * (1.0 + 0.1 * np.sin(np.pi / 7.0)))
     assert brightness.at(7.0) == pytest.approx(0.6)
 
 
 def test_without_jumps_the_gain_is_constant() -> None:
     random = np.random.default_rng(0)
-    brightness = make_brightness(sim.SessionImages(light=0.7), 0.0, 60.0, random)
+    brightness = imaging.make_brightness(sim.SessionImages(light=0.7), 0.0, 60.0, random)
     assert {brightness.at(time) for time in np.linspace(0.0, 60.0, 100)} == {0.7}
 
 
@@ -156,7 +151,7 @@ def test_the_number_of_threads_does_not_change_a_byte(tmp_path: Path) -> None:
     scenario = dataclasses.replace(
         FLIGHT, images=dataclasses.replace(FLIGHT.images, noise_sigma=2.0)
     )
-    painted = painted_boxes(
+    painted = ray_caster.painted_boxes(
         make_scene(
             data().world.bounds, data().world.boxes, scenario.images, np.random.default_rng(0)
         )
@@ -166,8 +161,8 @@ def test_the_number_of_threads_does_not_change_a_byte(tmp_path: Path) -> None:
         folder = tmp_path / str(threads)
         for row in (0, 1):
             (folder / f"cam{row}").mkdir(parents=True)
-        folders = SessionFolders(folder, folder)
-        write_images(scenario, 0, data().recordings[0], painted, folders, threads=threads)
+        folders = raw_data.SessionFolders(folder, folder)
+        raw_data.write_images(scenario, 0, data().recordings[0], painted, folders, threads=threads)
         files = sorted(path for path in folder.rglob("*.png"))
         contents.append({file.relative_to(folder): file.read_bytes() for file in files})
     assert len(contents[0]) == 24
@@ -175,13 +170,13 @@ def test_the_number_of_threads_does_not_change_a_byte(tmp_path: Path) -> None:
 
 
 def test_a_written_folder_is_a_recording(tmp_path: Path) -> None:
-    write_raw_data(FLIGHT, data(), tmp_path)
+    raw_data.write_raw_data(FLIGHT, data(), tmp_path)
     folder = tmp_path / "raw" / "session_1"
-    recording = open_recording(folder)
+    recording = reader_choice.open_recording(folder)
     session = data().recordings[0]
-    events = list(EventStream(recording))
-    frames = [event for event in events if isinstance(event, FrameSet)]
-    imu = [event for event in events if isinstance(event, ImuBatch)]
+    events = list(stream.EventStream(recording))
+    frames = [event for event in events if isinstance(event, protocol.FrameSet)]
+    imu = [event for event in events if isinstance(event, protocol.ImuBatch)]
     np.testing.assert_array_equal([frame.time_ns for frame in frames], session.recording.time_ns)
     np.testing.assert_array_equal(
         np.concatenate([batch.accel_gyro for batch in imu]), session.recording.imu.accel_gyro
@@ -203,8 +198,8 @@ def test_a_written_folder_is_a_recording(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", FLIGHTS)
 def test_flights_are_stereo_recordings_at_20_hz(name: str) -> None:
-    assert name in scenario_names()
-    scenario = load_scenario(name)
+    assert name in scenario_file.scenario_names()
+    scenario = scenario_file.load_scenario(name)
     assert scenario.images.render
     assert len(scenario.cameras) == 2
     assert scenario.measurement.frame_rate_hz == 20.0
@@ -214,7 +209,7 @@ def test_flights_are_stereo_recordings_at_20_hz(name: str) -> None:
 
 def _motion(name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return positions, speeds [m/s] and rates [rad/s] of a scenario at 200 Hz."""
-    scenario = load_scenario(name)
+    scenario = scenario_file.load_scenario(name)
     few = dataclasses.replace(
         scenario,
         world=dataclasses.replace(scenario.world, landmarks_per_room=100),
@@ -243,7 +238,7 @@ def test_flights_do_what_their_names_say() -> None:
 
 
 def test_the_dark_flight_is_dark() -> None:
-    images = load_scenario("flight_dark").sessions[0].images
+    images = scenario_file.load_scenario("flight_dark").sessions[0].images
     assert images.light < 0.5
     assert images.gain_jump > 0.0
 
@@ -263,13 +258,13 @@ def test_the_dark_flight_is_dark() -> None:
 )
 def test_mistakes_in_sessions_are_named(session: str, message: str) -> None:
     with pytest.raises(UserError, match=message) as caught:
-        parse_scenario(f"sessions: [{{{session}}}]", "mine.yaml")
+        scenario_file.parse_scenario(f"sessions: [{{{session}}}]", "mine.yaml")
     assert "\n" not in str(caught.value)
 
 
 def test_bare_share_is_a_share() -> None:
     with pytest.raises(UserError, match=r"images\.bare_share: must be at least 0 and at most 1"):
-        parse_scenario("images: {bare_share: 2}", "mine.yaml")
+        scenario_file.parse_scenario("images: {bare_share: 2}", "mine.yaml")
 
 
 def test_poses_of_the_states_are_those_of_the_images() -> None:

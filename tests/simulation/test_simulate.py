@@ -9,13 +9,10 @@ import pytest
 
 from maplab_py.geometry import se3
 from maplab_py.sensors.projection import project
-from maplab_py.simulation.demo import demonstrate
+from maplab_py.simulation import demo, scenario_file
 from maplab_py.simulation.scenario import CameraOptions, Scenario, Seeds, SessionOptions
-from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import SessionSimulator, SimulatedData, simulate
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.consistency import check_consistency
-from maplab_py.vimap.merge import merge_maps
+from maplab_py.vimap import VIMap, consistency, merge
 from tests.simulation.small import PERFECT, SMALL, simulated
 from tests.support.machine import slowness
 
@@ -55,9 +52,9 @@ def _true_residuals(data: SimulatedData) -> np.ndarray:
 
 def test_maps_are_consistent_and_merge() -> None:
     data = simulated()
-    merged, _ = merge_maps(*data.maps)
+    merged, _ = merge.merge_maps(*data.maps)
     for vi_map in (*data.maps, merged):
-        report = check_consistency(vi_map)
+        report = consistency.check_consistency(vi_map)
         assert report.errors == ()
         assert report.warnings == ()
     assert len(merged.missions) == 2
@@ -87,7 +84,7 @@ def test_without_noise_every_model_and_a_rig_of_two(
     scenario = dataclasses.replace(PERFECT, cameras=(CameraOptions(), second))
     data = simulate(scenario)
     assert len(data.maps[0].frames) == 2 * len(data.maps[0].vertices)
-    assert check_consistency(data.maps[0]).errors == ()
+    assert consistency.check_consistency(data.maps[0]).errors == ()
     assert np.abs(_true_residuals(data)).max() < 1e-9
 
 
@@ -181,7 +178,7 @@ def test_clutter_and_broken_tracks() -> None:
 
 @pytest.mark.slow
 def test_long_session_takes_at_most_20_seconds() -> None:
-    scenario = load_scenario("single_session")
+    scenario = scenario_file.load_scenario("single_session")
     # processor time: others may be at work on the machine
     start = time.process_time()
     data = simulate(scenario)
@@ -232,7 +229,7 @@ class RecordingConsole:
 
 def test_the_usual_commands_are_run_in_order(tmp_path: Path) -> None:
     console = RecordingConsole()
-    report = demonstrate(console, Scenario(), tmp_path / "my demo", overwrite=False)
+    report = demo.demonstrate(console, Scenario(), tmp_path / "my demo", overwrite=False)
     first = report.missions[0].mission
     load, *workflow = console.lines
     assert load.startswith("load_merge_all_maps --maps_folder=")
@@ -251,6 +248,6 @@ def test_the_usual_commands_are_run_in_order(tmp_path: Path) -> None:
 
 
 def test_a_map_that_stays_as_it_was_has_missed_the_goal(tmp_path: Path) -> None:
-    report = demonstrate(RecordingConsole(), Scenario(), tmp_path, overwrite=True)
+    report = demo.demonstrate(RecordingConsole(), Scenario(), tmp_path, overwrite=True)
     assert report.ate_after_m == report.ate_before_m > 0.0
     assert "initial error" in report.failure or "wrongly anchored" in report.failure

@@ -3,9 +3,8 @@
 import dataclasses
 from pathlib import Path
 
+from maplab_py.simulation import raw_data, ray_caster
 from maplab_py.simulation import scenario as sim
-from maplab_py.simulation.raw_data import write_raw_data
-from maplab_py.simulation.ray_caster import cast_rays
 from maplab_py.simulation.shading_kernels import pack_texels
 from maplab_py.simulation.simulate import simulate
 from maplab_py.warmup import jobs
@@ -15,7 +14,7 @@ CAMERA = sim.CameraOptions(intrinsics=(40.0, 40.0, 40.0, 30.0), width_px=80, hei
 
 def test_rendering_compiles_nothing_after_the_warmup(tmp_path: Path) -> None:
     jobs()["image rendering"]()
-    before = [list(kernel.signatures) for kernel in (cast_rays, pack_texels)]
+    before = [list(kernel.signatures) for kernel in (ray_caster.cast_rays, pack_texels)]
     assert all(before)
     scenario = sim.Scenario(
         world=sim.WorldOptions(landmarks_per_room=300),
@@ -31,5 +30,5 @@ def test_rendering_compiles_nothing_after_the_warmup(tmp_path: Path) -> None:
             ),
         ),
     )
-    write_raw_data(scenario, simulate(scenario), tmp_path)
-    assert [list(kernel.signatures) for kernel in (cast_rays, pack_texels)] == before
+    raw_data.write_raw_data(scenario, simulate(scenario), tmp_path)
+    assert [list(kernel.signatures) for kernel in (ray_caster.cast_rays, pack_texels)] == before

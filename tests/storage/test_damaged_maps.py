@@ -18,8 +18,7 @@ from maplab_py.errors import MapError
 from maplab_py.storage import map_saving
 from maplab_py.storage import maplab_map_pb2 as pb
 from maplab_py.storage.native import load_map, save_map
-from maplab_py.storage.protobuf.scan import MemoryBudget, estimate, quick_estimate
-from maplab_py.storage.protobuf.scan_kernel import count_parts
+from maplab_py.storage.protobuf import scan, scan_kernel
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.consistency import check_consistency, check_saved
 from maplab_py.vimap.number_repair import without_bad_numbers
@@ -27,15 +26,14 @@ from maplab_py.warmup import jobs
 from tests.e2e.support import run_program
 from tests.interop.small_map import VERTICES
 from tests.interop.small_map import make_map as rootless_map
-from tests.storage.damages import BOMB_ENTRIES, DAMAGES
-from tests.storage.damaging import BOUND_MEGABYTES, write_whole_map, zeros
+from tests.storage import damages, damaging
 from tests.support.data import REPOSITORY
 
 
 @pytest.fixture(scope="session")
 def whole_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("whole") / "map"
-    write_whole_map(folder)
+    damaging.write_whole_map(folder)
     return folder
 
 
@@ -45,20 +43,20 @@ def folder(whole_map: Path, tmp_path: Path) -> Path:
 
 
 def test_the_map_itself_is_whole(whole_map: Path) -> None:
-    vi_map, report = load_map(whole_map, max_size_megabytes=BOUND_MEGABYTES)
+    vi_map, report = load_map(whole_map, max_size_megabytes=damaging.BOUND_MEGABYTES)
     assert report.notes == []
     assert check_consistency(vi_map).failure == ""
-    assert len(DAMAGES) >= 79
+    assert len(damages.DAMAGES) >= 79
 
 
-@pytest.mark.parametrize("name", DAMAGES)
+@pytest.mark.parametrize("name", damages.DAMAGES)
 def test_damage_is_told_in_one_line(folder: Path, name: str) -> None:
-    damage = DAMAGES[name]
+    damage = damages.DAMAGES[name]
     damage.apply(folder)
     session = Session()
     session.run("create_new_map", map_key="earlier")
     before = session.maps.state
-    megabytes = {"proto_max_size_megabytes": BOUND_MEGABYTES}
+    megabytes = {"proto_max_size_megabytes": damaging.BOUND_MEGABYTES}
     if damage.is_note:
         session.run("load", map_folder=folder, **megabytes)
         _, report = load_map(folder)
@@ -100,7 +98,7 @@ def test_all_members_of_a_gzip_file_are_read(folder: Path, members: int) -> None
     ],
 )
 def test_what_repair_is_advised_for_it_repairs(folder: Path, tmp_path: Path, name: str) -> None:
-    DAMAGES[name].apply(folder)
+    damages.DAMAGES[name].apply(folder)
     vi_map, report = load_map(folder, repair=True)
     assert len(report.notes) == 1
     assert check_consistency(vi_map).failure == ""
@@ -138,8 +136,8 @@ def test_the_program_says_it_and_keeps_its_maps(whole_map: Path, tmp_path: Path)
     for number, name in enumerate(_IN_THE_PROGRAM):
         folder = tmp_path / f"damaged_{number}"
         shutil.copytree(whole_map, folder)
-        DAMAGES[name].apply(folder)
-        lines.append(f"load {folder} --proto_max_size_megabytes={BOUND_MEGABYTES}")
+        damages.DAMAGES[name].apply(folder)
+        lines.append(f"load {folder} --proto_max_size_megabytes={damaging.BOUND_MEGABYTES}")
     (tmp_path / "script").write_text("\n".join([*lines, "list"]))
     done = run_program(tmp_path, "run", "script", "--keep_going")
     assert done.returncode == Status.USER_ERROR
@@ -147,7 +145,7 @@ def test_the_program_says_it_and_keeps_its_maps(whole_map: Path, tmp_path: Path)
     errors = [line for line in done.stderr.splitlines() if line.startswith("error: load: ")]
     for number, (name, error) in enumerate(zip(_IN_THE_PROGRAM, errors, strict=True)):
         assert str(tmp_path / f"damaged_{number}") in error
-        assert all(part in error for part in DAMAGES[name].said)
+        assert all(part in error for part in damages.DAMAGES[name].said)
     (listed,) = [line for line in done.stdout.splitlines() if " saved " in line]
     assert listed.startswith("earlier")
 
@@ -171,13 +169,13 @@ except MapError as error:
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="needs the peak of memory")
 @pytest.mark.parametrize("megabytes", [40])
-@pytest.mark.parametrize("name", BOMB_ENTRIES)
+@pytest.mark.parametrize("name", damages.BOMB_ENTRIES)
 def test_a_bomb_takes_at_most_twice_the_bound(
     whole_map: Path, folder: Path, name: str, megabytes: int
 ) -> None:
-    file, entry, wrappers = BOMB_ENTRIES[name]
+    file, entry, wrappers = damages.BOMB_ENTRIES[name]
     size = megabytes * 900_000  # below the bound: only the entries tell
-    (folder / "vi_map" / file).write_bytes(zeros(entry, size, *wrappers))
+    (folder / "vi_map" / file).write_bytes(damaging.zeros(entry, size, *wrappers))
     done = subprocess.run(
         [sys.executable, "-c", _MEASURE, whole_map, folder, str(megabytes)],
         capture_output=True,
@@ -194,9 +192,9 @@ def test_many_files_are_charged_what_they_take(whole_map: Path) -> None:
     """Quick estimates that do not fit together give way to the exact ones."""
     path = whole_map / "vi_map/vertices0"
     data = gzip.decompress(path.read_bytes())
-    exact, quick = estimate(data, pb.VIMap.DESCRIPTOR), quick_estimate(data)
+    exact, quick = scan.estimate(data, pb.VIMap.DESCRIPTOR), scan.quick_estimate(data)
     assert exact < quick
-    budget = MemoryBudget(5 * exact)
+    budget = scan.MemoryBudget(5 * exact)
     for _ in range(10):
         budget.admit(path, data, pb.VIMap.DESCRIPTOR)
     with pytest.raises(MapError, match="vertices0: its entries need more than"):
@@ -236,12 +234,12 @@ def test_what_may_not_be_read_is_named_in_one_line(folder: Path, name: str) -> N
 
 def test_the_warmup_compiles_the_scan_of_messages_once_for_all() -> None:
     jobs()["message scan"]()
-    signatures = list(count_parts.signatures)
+    signatures = list(scan_kernel.count_parts.signatures)
     assert len(signatures) == 1
     data = pb.VIMapMetadata(files=[pb.FileTypeWithPath(path="a")]).SerializeToString()
-    assert estimate(data, pb.VIMapMetadata.DESCRIPTOR) > 0
-    assert estimate(bytearray(data), pb.VIMapMetadata.DESCRIPTOR) > 0
-    assert list(count_parts.signatures) == signatures
+    assert scan.estimate(data, pb.VIMapMetadata.DESCRIPTOR) > 0
+    assert scan.estimate(bytearray(data), pb.VIMapMetadata.DESCRIPTOR) > 0
+    assert list(scan_kernel.count_parts.signatures) == signatures
 
 
 PLACES = [

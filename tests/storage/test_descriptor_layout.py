@@ -11,8 +11,7 @@ import pytest
 from maplab_py.errors import MapError, UserError
 from maplab_py.storage.native import find_maps, load_map, save_map
 from maplab_py.storage.protobuf.descriptor_layout import read_blocks
-from maplab_py.vimap import DescriptorBlock, VIMap
-from maplab_py.vimap.consistency import check_consistency
+from maplab_py.vimap import DescriptorBlock, VIMap, consistency
 from maplab_py.vimap.tables import DescriptorLayout
 from tests.storage.test_native import differences
 from tests.support import descriptor_blocks as by_hand
@@ -28,7 +27,7 @@ def check_round_trip(source: Path, target: Path) -> VIMap:
     """Load, save and load; the descriptors of both files must be equal, byte for byte."""
     first, report = load_map(source)
     assert report.notes == []
-    assert check_consistency(first).failure == ""
+    assert consistency.check_consistency(first).failure == ""
     save_map(first, target)
     second, _ = load_map(target)
     assert by_hand.described(target) == by_hand.described(source)

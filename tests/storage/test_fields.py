@@ -12,8 +12,7 @@ from maplab_py.storage import maplab_map_pb2 as pb
 from maplab_py.storage.extension_fields import read_extension, with_extension
 from maplab_py.storage.mission_names import FILE_NAME, is_name, named, with_folder_names
 from maplab_py.storage.native import load_map, save_map
-from maplab_py.storage.protobuf.ids import unknown_bytes
-from maplab_py.storage.protobuf.map_files import read_unpacked
+from maplab_py.storage.protobuf import ids, map_files
 from maplab_py.vimap.ids import to_hex_list
 from maplab_py.vimap.merge import merge_maps
 from tests.console.sample_plugin import map_of
@@ -33,9 +32,9 @@ def edited(folder: Path, name: str, edit: Callable[[pb.VIMap], None]) -> None:
 def test_files_of_both_kinds_are_bounded(tmp_path: Path, packed: bool) -> None:
     path = tmp_path / "file"
     path.write_bytes(gzip.compress(bytes(1000)) if packed else bytes(1000))
-    assert read_unpacked(path, 1000) == bytes(1000)
+    assert map_files.read_unpacked(path, 1000) == bytes(1000)
     with pytest.raises(MapError, match="--proto_max_size_megabytes"):
-        read_unpacked(path, 999)
+        map_files.read_unpacked(path, 999)
 
 
 def test_switch_variables_come_back_with_their_variances(tmp_path: Path) -> None:
@@ -115,7 +114,7 @@ def test_protobuf_reads_and_writes_it_as_an_unknown_field() -> None:
     again = pb.Mission()
     again.ParseFromString(mission.SerializeToString())
     assert again.backbone == 1
-    assert read_extension(unknown_bytes(again), 1000) == b"closures"
+    assert read_extension(ids.unknown_bytes(again), 1000) == b"closures"
 
 
 @pytest.mark.parametrize("damaged", [b"\xc2\x3e\x05ab", b"\xc2", b"\xc7\x3e"])

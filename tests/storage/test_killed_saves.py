@@ -7,16 +7,15 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.data import REPOSITORY
-from tests.support.programs import module_of_tests
+from tests.support import data, programs
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs fork and SIGKILL")
 
 
 def outcomes(folder: Path, *words: str) -> list[str]:
     done = subprocess.run(
-        [*module_of_tests("tests.storage.kills"), str(folder), *words],
-        cwd=REPOSITORY,
+        [*programs.module_of_tests("tests.storage.kills"), str(folder), *words],
+        cwd=data.REPOSITORY,
         capture_output=True,
         text=True,
         check=False,

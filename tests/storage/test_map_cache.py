@@ -13,9 +13,7 @@ from maplab_py.errors import MapError
 from maplab_py.storage import native
 from maplab_py.storage.cache.column_file import mapped_bytes
 from maplab_py.storage.native import LoadReport, MapCache, load_map, save_map
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.comparison import is_same
-from maplab_py.vimap.edits import remove_landmarks
+from maplab_py.vimap import VIMap, comparison, edits
 from tests.support.data import shared_data
 
 SUBMAP = "maplab_maps/euroc_v1_01/euroc_v1_01_submap_3"
@@ -52,7 +50,7 @@ def test_a_map_from_the_cache_is_the_map_of_the_files(folder: Path, cache: MapCa
     from_files, plain = load_map(folder)
     vi_map, first, second = loads(folder, cache)
     assert (plain.cache, first.cache, second.cache) == ("", "written", "read")
-    assert is_same(vi_map, from_files)
+    assert comparison.is_same(vi_map, from_files)
     assert second.notes == plain.notes
     assert (second.files, second.megabytes) == (plain.files, plain.megabytes)
     assert entry(cache).stat().st_mode & 0o077 == 0 or cache.folder.stat().st_mode & 0o077 == 0
@@ -123,7 +121,7 @@ def test_a_damaged_entry_is_told_and_written_again(
     load_map(folder, cache=cache)
     damage(entry(cache))
     vi_map, report = load_map(folder, cache=cache)
-    assert is_same(vi_map, from_files)
+    assert comparison.is_same(vi_map, from_files)
     assert report.cache == "written"
     assert any(said in note for note in report.notes)
     entry(cache).chmod(0o600)
@@ -137,7 +135,7 @@ def test_an_entry_of_another_map_under_this_name_is_refused(
     wanted = entry(cache)
     other = tmp_path / "other"
     vi_map, _ = load_map(folder)
-    save_map(remove_landmarks(vi_map, np.arange(len(vi_map.landmarks)) < 5), other)
+    save_map(edits.remove_landmarks(vi_map, np.arange(len(vi_map.landmarks)) < 5), other)
     load_map(other, cache=cache)
     (foreign,) = set(cache.folder.glob("*.columns")) - {wanted}
     os.replace(foreign, wanted)
@@ -148,7 +146,7 @@ def test_an_entry_of_another_map_under_this_name_is_refused(
 
 def test_a_changed_map_is_not_taken_from_the_cache(folder: Path, cache: MapCache) -> None:
     vi_map, _, _ = loads(folder, cache)
-    smaller = remove_landmarks(vi_map, np.arange(len(vi_map.landmarks)) < 10)
+    smaller = edits.remove_landmarks(vi_map, np.arange(len(vi_map.landmarks)) < 10)
     before = vi_map.keypoints.uv_px.copy()
     save_map(smaller, folder, overwrite=True)  # while its columns are mapped
     loaded, report = load_map(folder, cache=cache)
@@ -161,7 +159,7 @@ def test_a_mapped_map_outlives_its_entry(folder: Path, cache: MapCache) -> None:
     vi_map, _, _ = loads(folder, cache)
     expected, _ = load_map(folder)
     entry(cache).unlink()
-    assert is_same(vi_map.keypoints, expected.keypoints)
+    assert comparison.is_same(vi_map.keypoints, expected.keypoints)
 
 
 def test_a_file_without_its_checksum_is_refused_with_a_cache_as_without(
@@ -186,7 +184,7 @@ def test_a_repaired_map_is_not_cached(folder: Path, cache: MapCache) -> None:
 def test_the_oldest_entries_are_deleted(folder: Path, tmp_path: Path) -> None:
     vi_map, _ = load_map(folder)
     second = tmp_path / "second"
-    save_map(remove_landmarks(vi_map, np.arange(len(vi_map.landmarks)) < 3), second)
+    save_map(edits.remove_landmarks(vi_map, np.arange(len(vi_map.landmarks)) < 3), second)
     cache = MapCache(1.5 * vi_map.nbytes() / 1e9, tmp_path / "cache")
     load_map(folder, cache=cache)
     first_entry = entry(cache)
@@ -220,5 +218,5 @@ def test_commands_do_the_same_on_mapped_columns(
         session.run("save", map_folder=tmp_path / f"result_{len(results)}")
         results.append(session.vi_map)
     assert len(list((tmp_path / "cache").glob("*.columns"))) == 1
-    assert is_same(results[0], results[1])
-    assert is_same(results[0], results[2])
+    assert comparison.is_same(results[0], results[1])
+    assert comparison.is_same(results[0], results[2])

@@ -16,10 +16,8 @@ from maplab_py.progress import SilentProgress
 from maplab_py.sensors import Distortion, Projection
 from maplab_py.storage import maplab_map_pb2 as pb
 from maplab_py.storage.native import disk_copy, load_map, save_map
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.consistency import check_consistency
-from tests.support.data import shared_data
-from tests.support.scene import Scene
+from maplab_py.vimap import VIMap, consistency
+from tests.support import data, scene
 
 SUBMAP = "maplab_maps/euroc_v1_01/euroc_v1_01_submap_3"
 
@@ -41,7 +39,7 @@ def differences(a: VIMap, b: VIMap) -> list[str]:
 
 def damaged_copy(tmp_path: Path, damage: Callable[[Path], None]) -> Path:
     folder = tmp_path / "map"
-    shutil.copytree(shared_data(SUBMAP), folder)
+    shutil.copytree(data.shared_data(SUBMAP), folder)
     for path in [folder, *folder.rglob("*")]:
         path.chmod(0o755)
     damage(folder)
@@ -57,7 +55,7 @@ def rewritten(folder: Path, name: str, change: Callable[[pb.VIMap], None]) -> No
 
 def test_saved_messages_hold_what_the_original_files_hold(tmp_path: Path) -> None:
     """Compare entity by entity with the original files, without this project's reader."""
-    source = shared_data(SUBMAP)
+    source = data.shared_data(SUBMAP)
     save_map(load_map(source)[0], tmp_path / "map")
 
     def entities(folder: Path) -> dict[tuple[int, ...], object]:
@@ -198,11 +196,11 @@ def test_repair_keeps_what_both_sides_say(tmp_path: Path) -> None:
     folder = damaged_copy(tmp_path, _disagreement)
     vi_map, report = load_map(folder, repair=True)
     assert report.notes
-    assert check_consistency(vi_map).failure == ""
+    assert consistency.check_consistency(vi_map).failure == ""
 
 
 def test_a_changed_byte_is_found_by_its_checksum(tmp_path: Path) -> None:
-    save_map(load_map(shared_data(SUBMAP))[0], tmp_path / "map")
+    save_map(load_map(data.shared_data(SUBMAP))[0], tmp_path / "map")
     path = tmp_path / "map/vi_map/sensors.yaml"
     path.write_text(path.read_text() + "\n# touched\n")
     with pytest.raises(MapError, match=r"sensors\.yaml"):
@@ -210,7 +208,7 @@ def test_a_changed_byte_is_found_by_its_checksum(tmp_path: Path) -> None:
 
 
 def test_saving_refuses_what_it_must_not_replace(tmp_path: Path) -> None:
-    vi_map, _ = load_map(shared_data(SUBMAP))
+    vi_map, _ = load_map(data.shared_data(SUBMAP))
     save_map(vi_map, tmp_path / "map")
     with pytest.raises(UserError, match="--overwrite"):
         save_map(vi_map, tmp_path / "map")
@@ -222,7 +220,7 @@ def test_saving_refuses_what_it_must_not_replace(tmp_path: Path) -> None:
 
 
 def test_same_map_same_bytes_and_resources_stay(tmp_path: Path) -> None:
-    vi_map, _ = load_map(shared_data(SUBMAP))
+    vi_map, _ = load_map(data.shared_data(SUBMAP))
     save_map(vi_map, tmp_path / "map")
     resource = tmp_path / "map/resources/raw_images/a.pgm"
     resource.parent.mkdir(parents=True)
@@ -234,7 +232,7 @@ def test_same_map_same_bytes_and_resources_stay(tmp_path: Path) -> None:
 
 
 def test_what_else_lies_in_the_folder_stays(tmp_path: Path) -> None:
-    vi_map, _ = load_map(shared_data(SUBMAP))
+    vi_map, _ = load_map(data.shared_data(SUBMAP))
     folder = tmp_path / "map"
     save_map(vi_map, folder)
     (tmp_path / "disk").mkdir()
@@ -250,7 +248,7 @@ def test_what_else_lies_in_the_folder_stays(tmp_path: Path) -> None:
 
 
 def test_the_fingerprint_stands_for_the_content(tmp_path: Path) -> None:
-    vi_map, _ = load_map(shared_data(SUBMAP))
+    vi_map, _ = load_map(data.shared_data(SUBMAP))
     first = save_map(vi_map, tmp_path / "a").fingerprint
     assert save_map(vi_map, tmp_path / "b").fingerprint == first
     assert disk_copy(tmp_path / "a").fingerprint == first
@@ -263,7 +261,7 @@ def test_the_fingerprint_stands_for_the_content(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(os.name != "posix", reason="the lock is a POSIX one")
 def test_the_second_program_that_saves_is_told(tmp_path: Path) -> None:
-    vi_map, _ = load_map(shared_data(SUBMAP))
+    vi_map, _ = load_map(data.shared_data(SUBMAP))
     with replaced_folder(tmp_path / "map") as temporary:
         with pytest.raises(UserError, match="another program is saving"):
             save_map(vi_map, tmp_path / "map")
@@ -282,8 +280,8 @@ def test_saving_says_once_that_maplab_does_not_know_a_model(tmp_path: Path) -> N
     known, unknown = Lines(), Lines()
     radtan = (Projection.PINHOLE, Distortion.RADTAN)
     double_sphere = (Projection.DOUBLE_SPHERE, Distortion.NONE)
-    save_map(Scene(vertices=3, models=(radtan,)).make(), tmp_path / "a", progress=known)
-    vi_map = Scene(vertices=3, models=(radtan, double_sphere, double_sphere)).make()
+    save_map(scene.Scene(vertices=3, models=(radtan,)).make(), tmp_path / "a", progress=known)
+    vi_map = scene.Scene(vertices=3, models=(radtan, double_sphere, double_sphere)).make()
     save_map(vi_map, tmp_path / "b", progress=unknown)
     assert known.lines == []
     assert unknown.lines == [

@@ -17,10 +17,7 @@ from maplab_py.storage.resources import files as resource_files
 from maplab_py.storage.resources import store as resource_store
 from maplab_py.storage.resources.new import NewResources
 from maplab_py.storage.resources.types import RESOURCE_TYPES, resource_type, resource_type_of
-from maplab_py.vimap import ResourceOwner, Resources, VIMap, random_ids
-from maplab_py.vimap.consistency import check_consistency
-from maplab_py.vimap.edits import remove_missions
-from maplab_py.vimap.merge import merge_maps
+from maplab_py.vimap import ResourceOwner, Resources, VIMap, consistency, edits, merge, random_ids
 from maplab_py.vimap.queries import resource_missions, resources_of, without_resources
 from tests.simulation.small import simulated
 from tests.support.data import shared_data
@@ -86,13 +83,13 @@ def test_missing_and_orphaned_files_are_named(plain: VIMap, tmp_path: Path) -> N
     missing.unlink()
     orphan = folder / "resources" / "text" / "note.txt"
     orphan.write_text("left over")
-    report = resource_files.with_file_checks(check_consistency(loaded), loaded, folder)
+    report = resource_files.with_file_checks(consistency.check_consistency(loaded), loaded, folder)
     assert [(e.rule, e.where) for e in report.errors] == [
         ("resource whose file is missing", (str(missing),))
     ]
     assert report.warnings[-1].where == (str(orphan.resolve()),)
     assert "missing" in report.failure
-    homeless = resource_files.with_file_checks(check_consistency(loaded), loaded, None)
+    homeless = resource_files.with_file_checks(consistency.check_consistency(loaded), loaded, None)
     assert homeless.errors[0].count == len(loaded.resources)
 
 
@@ -317,7 +314,7 @@ def test_staged_images_can_be_read_and_are_saved(
     plain_map: VIMap, temporary: Path, tmp_path: Path
 ) -> None:
     vi_map = with_images(plain_map, temporary)
-    assert check_consistency(vi_map).failure == ""
+    assert consistency.check_consistency(vi_map).failure == ""
     np.testing.assert_array_equal(images_of(vi_map, Path()), IMAGES)
     save_map(vi_map, tmp_path / "map")
     loaded, _ = load_map(tmp_path / "map")
@@ -340,7 +337,7 @@ def test_the_temporary_folder_is_deleted_with_the_last_map(
     plain_map: VIMap, temporary: Path
 ) -> None:
     vi_map = with_images(plain_map, temporary)
-    smaller = remove_missions(vi_map, [0])
+    smaller = edits.remove_missions(vi_map, [0])
     del vi_map
     gc.collect()
     assert len(list(temporary.iterdir())) == 1
@@ -436,7 +433,7 @@ def test_an_unknown_type_is_refused(temporary: Path) -> None:
 
 def test_merged_maps_keep_staged_files(plain_map: VIMap, temporary: Path, tmp_path: Path) -> None:
     base = with_images(plain_map, temporary, b"a")
-    merged, _ = merge_maps(base, with_images(plain_map, temporary, b"b"), assign_new_ids=True)
+    merged, _ = merge.merge_maps(base, with_images(plain_map, temporary, b"b"), assign_new_ids=True)
     del base
     gc.collect()
     save_map(merged, tmp_path / "map")

@@ -15,22 +15,16 @@ import pytest
 
 from maplab_py.array_types import U64
 from maplab_py.errors import MapError, UserError
+from maplab_py.storage import checksums, reading_processes
 from maplab_py.storage import maplab_map_pb2 as pb
-from maplab_py.storage import reading_processes
-from maplab_py.storage.checksums import map_in_threads
 from maplab_py.storage.native import load_map, save_map
+from maplab_py.storage.protobuf import map_files, scan
 from maplab_py.storage.protobuf.file_contents import ColumnDigests, FileContent, digest_of
-from maplab_py.storage.protobuf.map_files import listed_files
-from maplab_py.storage.protobuf.scan import MemoryBudget
 from maplab_py.storage.protobuf.tables_to_messages import Partition, contents, index_to_bytes
 from maplab_py.storage.protobuf.vertices_to_messages import id_fields, tag_of
 from maplab_py.storage.reading_processes import parts_ahead
 from maplab_py.storage.unchanged_files import WrittenFiles
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.comparison import is_same
-from maplab_py.vimap.edits import remove_missions
-from maplab_py.vimap.merge import merge_maps
-from maplab_py.vimap.table import Table
+from maplab_py.vimap import VIMap, comparison, edits, merge, table
 from tests.pipeline.support import child_processes
 from tests.vimap.builders import walk_map
 
@@ -41,7 +35,7 @@ def three_missions() -> VIMap:
     vi_map = walk_map(seed=0, first_ns=10**9)
     for number in (1, 2):
         other = walk_map(seed=number, first_ns=10**9 * (1 + 100 * number))
-        vi_map, _ = merge_maps(vi_map, other)
+        vi_map, _ = merge.merge_maps(vi_map, other)
     with tempfile.TemporaryDirectory() as folder:
         save_map(vi_map, Path(folder) / "map")
         return load_map(Path(folder) / "map")[0]
@@ -66,10 +60,12 @@ def changed(before: dict[str, int], after: dict[str, int]) -> set[str]:
 def holds(folder: Path, vi_map: VIMap) -> bool:
     """Tell whether a folder is a sound map with the tables of a map."""
     loaded = load_map(folder)[0]
-    return all(is_same(getattr(loaded, name), getattr(vi_map, name)) for name in TABLES)
+    return all(comparison.is_same(getattr(loaded, name), getattr(vi_map, name)) for name in TABLES)
 
 
-TABLES = [f.name for f in dataclasses.fields(VIMap) if isinstance(getattr(VIMap(), f.name), Table)]
+TABLES = [
+    f.name for f in dataclasses.fields(VIMap) if isinstance(getattr(VIMap(), f.name), table.Table)
+]
 ALWAYS = {"missions", "sensors.yaml", "vi_map_metadata"}
 
 
@@ -172,7 +168,7 @@ def test_files_that_are_taken_over_are_not_flushed_again(
 
 def test_a_mission_that_grows_leaves_the_files_of_others(tmp_path: Path) -> None:
     vi_map, target, written = three_missions(), tmp_path / "map", WrittenFiles()
-    without = remove_missions(vi_map, np.arange(3) == 1)
+    without = edits.remove_missions(vi_map, np.arange(3) == 1)
     save_map(without, target, written=written)
     before = inodes(target)
     save_map(vi_map, target, force=True, written=written)
@@ -289,7 +285,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(reading_processes, "_WORTH_PROCESSES", 0)
     monkeypatch.setattr(reading_processes, "_processors", lambda: 2)
     vi_map = walk_map(vertices=55, seed=0, first_ns=10**9)
-    vi_map, _ = merge_maps(vi_map, walk_map(vertices=60, seed=1, first_ns=10**12))
+    vi_map, _ = merge.merge_maps(vi_map, walk_map(vertices=60, seed=1, first_ns=10**12))
     save_map(vi_map, tmp_path / "map")
     return tmp_path / "map"
 
@@ -304,7 +300,7 @@ def read_here(folder: Path) -> VIMap:
 def test_processes_read_the_same_map(folder: Path) -> None:
     others = {*child_processes(os.getpid())}  # of earlier tests
     vi_map, report = load_map(folder)
-    assert is_same(vi_map, read_here(folder))
+    assert comparison.is_same(vi_map, read_here(folder))
     assert report.vertices == 115
     assert not {*child_processes(os.getpid())} - others
 
@@ -330,12 +326,12 @@ def test_a_bound_on_memory_holds_for_all_processes_together(folder: Path) -> Non
 
 def test_what_a_dead_process_had_is_read_here(folder: Path) -> None:
     others = {*child_processes(os.getpid())}
-    files = listed_files(folder)
+    files = map_files.listed_files(folder)
     with parts_ahead(files) as ahead:
         assert ahead is not None
         for process in {*child_processes(os.getpid())} - others:
             os.kill(process, signal.SIGKILL)
-        ahead.start(MemoryBudget(10**9))
+        ahead.start(scan.MemoryBudget(10**9))
         assert [ahead.take(path) for _, path in files] == [None] * len(files)
 
 
@@ -348,11 +344,11 @@ def test_where_no_process_can_be_started_the_files_are_read_here(
         raise OSError("Resource temporarily unavailable")
 
     monkeypatch.setattr("subprocess.Popen", refused)
-    assert is_same(load_map(folder)[0], expected)
+    assert comparison.is_same(load_map(folder)[0], expected)
 
 
 def test_results_are_in_the_order_of_the_values() -> None:
-    assert map_in_threads(pow, range(50), [2] * 50) == [n**2 for n in range(50)]
+    assert checksums.map_in_threads(pow, range(50), [2] * 50) == [n**2 for n in range(50)]
 
 
 def test_without_threads_the_results_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -360,9 +356,9 @@ def test_without_threads_the_results_are_the_same(monkeypatch: pytest.MonkeyPatc
         raise RuntimeError("can't start new thread")
 
     monkeypatch.setattr(threading.Thread, "start", refuse)
-    assert map_in_threads(str, range(3)) == ["0", "1", "2"]
+    assert checksums.map_in_threads(str, range(3)) == ["0", "1", "2"]
 
 
 def test_errors_of_the_function_reach_the_caller() -> None:
     with pytest.raises(ZeroDivisionError):
-        map_in_threads(lambda n: 1 // n, [1, 0])
+        checksums.map_in_threads(lambda n: 1 // n, [1, 0])

@@ -10,19 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.estimation.codegen.kernels import residual_kernel, visual_kernels
-from maplab_py.estimation.imu.inertial_data import InertialData
-from maplab_py.estimation.imu.preintegration import integrate
+from maplab_py.estimation.imu import inertial_data, preintegration
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.problem.problem import Problem
 from maplab_py.estimation.states import States
 from maplab_py.estimation.symbolic.sources import inertial
-from maplab_py.estimation.terms.cameras import Cameras
+from maplab_py.estimation.terms import cameras, protocol
 from maplab_py.estimation.terms.inertial import BiasWalkTerm, InertialTerm
-from maplab_py.estimation.terms.protocol import FactorTerm
 from maplab_py.estimation.terms.visual import Observations, VisualTerms
 from maplab_py.geometry import se3, so3
-from maplab_py.sensors import CameraRig, Imu
-from maplab_py.sensors.projection import project, project_with_jacobians
+from maplab_py.sensors import CameraRig, Imu, projection
 from maplab_py.vimap import VIMap
 
 F64 = NDArray[np.float64]
@@ -35,7 +32,7 @@ class DenseProblem:
     rig: CameraRig
     observations: Observations
     visual: VisualTerms | None
-    factors: list[FactorTerm]
+    factors: list[protocol.FactorTerm]
     states: States
 
     def problem(self) -> Problem:
@@ -56,7 +53,7 @@ class DenseProblem:
         for row, camera in enumerate(self.rig.cameras):
             own = data.camera == row
             T_G_C = se3.compose(states.T_G_I[data.vertex[own]], self.rig.T_B_C[row])
-            uv, visible = project(camera, se3.transform(se3.inverse(T_G_C), p_G[own]))
+            uv, visible = projection.project(camera, se3.transform(se3.inverse(T_G_C), p_G[own]))
             assert visible.all()
             result[own] = uv - data.uv_px[own]
         return np.asarray(result * data.inverse_sigma[:, None])
@@ -100,7 +97,7 @@ class DenseProblem:
             T_G_I = states.T_G_I[data.vertex[own]]
             p_I = se3.transform(se3.inverse(T_G_I), states.p_G[data.landmark[own]])
             T_C_I = se3.inverse(self.rig.T_B_C[row])
-            _, by_p_C, _, _ = project_with_jacobians(camera, se3.transform(T_C_I, p_I))
+            _, by_p_C, _, _ = projection.project_with_jacobians(camera, se3.transform(T_C_I, p_I))
             by_p_I = by_p_C @ so3.to_matrix(T_C_I[:4])
             point[own] = by_p_I @ so3.to_matrix(so3.inverse(T_G_I[:, :4]))
             pose[own, :, :3] = -point[own]
@@ -160,7 +157,7 @@ def dense_problem(
         visual = VisualTerms(
             visual_kernels(),
             observations,
-            Cameras.of(rig.cameras, rig.T_B_C),
+            cameras.Cameras.of(rig.cameras, rig.T_B_C),
             len(vi_map.vertices),
             loss=loss,
             move_points=move_points,
@@ -169,12 +166,12 @@ def dense_problem(
     return DenseProblem(rig, observations, visual, factors, states)
 
 
-def _inertial(vi_map: VIMap, imu: Imu) -> list[FactorTerm]:
+def _inertial(vi_map: VIMap, imu: Imu) -> list[protocol.FactorTerm]:
     edges = vi_map.imu_edges
-    data = InertialData.of_map(vi_map)
+    data = inertial_data.InertialData.of_map(vi_map)
     first, second = edges.from_vertex.astype(np.int64), edges.to_vertex.astype(np.int64)
     g_G = np.tile([0.0, 0.0, -imu.gravity_magnitude_mps2], (len(edges), 1))
-    walk = integrate(data, np.zeros(3), np.zeros(3))
+    walk = preintegration.integrate(data, np.zeros(3), np.zeros(3))
     term = InertialTerm(residual_kernel("inertial", inertial), data, first, second, g_G)
     return [
         term,

@@ -3,8 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.vimap import DescriptorBlock, DescriptorDepth, FeatureType, VIMap
-from maplab_py.vimap.table import object_column
+from maplab_py.vimap import DescriptorBlock, DescriptorDepth, FeatureType, VIMap, table
 
 
 def as_numbers(
@@ -28,7 +27,7 @@ def with_numbers(
         for count in vi_map.frames.keypoint_count.tolist()
     ]
     return vi_map.replace(
-        frames=vi_map.frames.replace(descriptor_blocks=object_column(blocks)),
+        frames=vi_map.frames.replace(descriptor_blocks=table.object_column(blocks)),
         keypoints=vi_map.keypoints.replace(descriptor=raw),
         landmarks=vi_map.landmarks.replace(
             feature_type=np.full(len(vi_map.landmarks), feature_type, dtype=np.int32)

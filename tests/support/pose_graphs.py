@@ -8,9 +8,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from maplab_py.algorithms.relaxation.graph_files import is_odometry
+from maplab_py.algorithms.relaxation import graph_files, robust
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
-from maplab_py.algorithms.relaxation.robust import optimize_robustly
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
 from maplab_py.estimation.problem.gauge import connected_parts
@@ -125,13 +124,13 @@ def optimize_graph(
     """
     edges = _edges(graph)
     is_plain = options.robustness == "none"
-    chain = np.ones(len(edges), dtype=np.bool_) if is_plain else is_odometry(graph)
+    chain = np.ones(len(edges), dtype=np.bool_) if is_plain else graph_files.is_odometry(graph)
     if np.all(chain):
         options = dataclasses.replace(options, robustness="none")
     is_free = np.ones(len(graph.id), dtype=np.bool_)
     is_free[_anchors(graph)] = False
     trajectory, loops = edges.take(np.flatnonzero(chain)), edges.take(np.flatnonzero(~chain))
-    solution = optimize_robustly(
+    solution = robust.optimize_robustly(
         graph.T_G_V, is_free, trajectory, loops, TiltPriors.none(), options, progress
     )
     weight = np.ones(len(edges))

@@ -10,17 +10,15 @@ import numpy as np
 
 from maplab_py.array_types import F64
 from maplab_py.interop.ply import parse_ply
-from maplab_py.simulation.raw_data import write_maps
-from maplab_py.simulation.scenario import Scenario
-from maplab_py.simulation.scenario_file import load_scenario
-from maplab_py.simulation.truth import Truth, true_map
+from maplab_py.simulation import raw_data, scenario_file, truth
+from maplab_py.simulation import scenario as sim
 from maplab_py.storage.native import load_map
 from maplab_py.vimap import VIMap
 
 
-def quarter_size(frame_rate_hz: float = 3.0) -> Scenario:
+def quarter_size(frame_rate_hz: float = 3.0) -> sim.Scenario:
     """Return the scenario with images of 376 x 240 pixels."""
-    scenario = load_scenario("stereo_room")
+    scenario = scenario_file.load_scenario("stereo_room")
     cameras = tuple(
         dataclasses.replace(
             camera,
@@ -41,9 +39,9 @@ class StereoRoom:
     folder: Path
 
     @classmethod
-    def simulated(cls, folder: Path, scenario: Scenario | None = None) -> StereoRoom:
+    def simulated(cls, folder: Path, scenario: sim.Scenario | None = None) -> StereoRoom:
         """Simulate and write it."""
-        write_maps(scenario or quarter_size(), folder, raw_data=True)
+        raw_data.write_maps(scenario or quarter_size(), folder, raw_data=True)
         return cls(folder)
 
     @property
@@ -62,7 +60,7 @@ class StereoRoom:
     def true_map(self) -> VIMap:
         """The map with true poses and calibration."""
         vi_map, _ = load_map(self.map_folder)
-        return true_map(vi_map, Truth.load(self.folder / "truth.npz"))
+        return truth.true_map(vi_map, truth.Truth.load(self.folder / "truth.npz"))
 
     def distances_to_surfaces(self, p_G: F64) -> F64:
         """Return the distances (N,) [m] of points (N, 3) to the true surfaces, all axis-aligned."""

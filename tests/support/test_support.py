@@ -8,15 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from maplab_py.algorithms.self_calibration.pruning import test_mutual_consistency, test_segments
-from maplab_py.geometry import so3
-from maplab_py.geometry.interpolation import nearest_rows
+from maplab_py.geometry import interpolation, so3
 from maplab_py.sensors import ImuIntrinsics
 from tests.mutation.fault import planted
 from tests.mutation.faults import AREAS
-from tests.support.association import associate
-from tests.support.data import REPOSITORY
-from tests.support.imu_model import correct_imu, distort_imu
-from tests.support.waiting import wait_until
+from tests.support import association, data, imu_model, waiting
 
 stamps = st.lists(st.integers(0, 60), max_size=12, unique=True).map(sorted).map(np.array)
 
@@ -35,13 +31,13 @@ def exhaustive(a: np.ndarray, b: np.ndarray, tolerance: int) -> list[tuple[int, 
 
 @given(stamps, stamps, st.integers(0, 10))
 def test_evos_definition(a: np.ndarray, b: np.ndarray, tolerance: int) -> None:
-    i, j = associate(a, b, tolerance, one_to_one=False)
+    i, j = association.associate(a, b, tolerance, one_to_one=False)
     assert list(zip(i.tolist(), j.tolist(), strict=True)) == exhaustive(a, b, tolerance)
 
 
 @given(stamps, stamps, st.integers(0, 10))
 def test_one_to_one(a: np.ndarray, b: np.ndarray, tolerance: int) -> None:
-    i, j = associate(a, b, tolerance)
+    i, j = association.associate(a, b, tolerance)
     assert len(set(i.tolist())) == len(set(j.tolist())) == len(i)
     assert np.all(np.abs(a[i] - b[j]) <= tolerance) if len(i) else True
     loose = exhaustive(a, b, tolerance)
@@ -51,27 +47,27 @@ def test_one_to_one(a: np.ndarray, b: np.ndarray, tolerance: int) -> None:
 
 
 def test_the_nearest_partner_wins() -> None:
-    i, j = associate([0, 10, 20, 1000], [8, 11, 500], 5)
+    i, j = association.associate([0, 10, 20, 1000], [8, 11, 500], 5)
     assert (i.tolist(), j.tolist()) == ([1], [1])
-    i, j = associate([0, 10, 20, 1000], [8, 11, 500], 5, one_to_one=False)
+    i, j = association.associate([0, 10, 20, 1000], [8, 11, 500], 5, one_to_one=False)
     assert (i.tolist(), j.tolist()) == ([1, 1], [0, 1])
 
 
 def test_nanoseconds_are_not_rounded() -> None:
     base = 1403715273262142976
-    i, _ = associate(base + np.array([0, 100, 200]), base + np.array([101]), 1)
+    i, _ = association.associate(base + np.array([0, 100, 200]), base + np.array([101]), 1)
     assert i.tolist() == [1]
 
 
 @pytest.mark.parametrize(("a", "b"), [([], []), ([1], []), ([], [1, 2])])
 def test_empty_lists(a: list[int], b: list[int]) -> None:
-    i, j = associate(np.array(a, dtype=np.int64), np.array(b, dtype=np.int64), 5)
+    i, j = association.associate(np.array(a, dtype=np.int64), np.array(b, dtype=np.int64), 5)
     assert (len(i), len(j)) == (0, 0)
 
 
 def test_nearest_rows_of_one_stamp() -> None:
-    assert nearest_rows([5], [1, 5, 9]).tolist() == [0, 0, 0]
-    assert nearest_rows([0, 10], [5, 6, -3, 40]).tolist() == [0, 1, 0, 1]
+    assert interpolation.nearest_rows([5], [1, 5, 9]).tolist() == [0, 0, 0]
+    assert interpolation.nearest_rows([0, 10], [5, 6, -3, 40]).tolist() == [0, 1, 0, 1]
 
 
 def test_the_equations() -> None:
@@ -79,7 +75,7 @@ def test_the_equations() -> None:
     T_g, T_a = (np.eye(3) + np.triu(rng.normal(size=(3, 3))) * 0.02 for _ in range(2))
     R_A_I = so3.to_matrix(so3.exp(rng.normal(size=3)))
     b_a, b_g, f, w = rng.normal(size=(4, 3))
-    out = distort_imu(ImuIntrinsics(T_g, T_a, R_A_I), np.concatenate([f, w]), b_a, b_g)
+    out = imu_model.distort_imu(ImuIntrinsics(T_g, T_a, R_A_I), np.concatenate([f, w]), b_a, b_g)
     assert np.allclose(out[:3], T_a @ (R_A_I @ f) + b_a)
     assert np.allclose(out[3:], T_g @ w + b_g)
 
@@ -90,13 +86,13 @@ def test_correction_inverts_and_batches() -> None:
     R_A_I = so3.to_matrix(so3.exp(rng.normal(size=3)))
     values, biases = rng.normal(size=(4, 5, 6)), rng.normal(size=(2, 4, 1, 3))
     for intrinsics in (None, ImuIntrinsics(T, T.copy(), R_A_I)):
-        reported = distort_imu(intrinsics, values, *biases)
+        reported = imu_model.distort_imu(intrinsics, values, *biases)
         assert reported.shape == values.shape
-        assert np.max(np.abs(correct_imu(intrinsics, reported, *biases) - values)) < 1e-13
+        assert np.max(np.abs(imu_model.correct_imu(intrinsics, reported, *biases) - values)) < 1e-13
 
 
 def test_no_intrinsics_adds_biases_only() -> None:
-    out = distort_imu(None, np.arange(6.0), [1, 2, 3], [10, 20, 30])
+    out = imu_model.distort_imu(None, np.arange(6.0), [1, 2, 3], [10, 20, 30])
     assert out.tolist() == [1, 3, 5, 13, 24, 35]
 
 
@@ -108,13 +104,13 @@ def test_functions_of_the_product_are_not_collected(request: pytest.FixtureReque
 
 def test_waiting_ends_with_the_condition_or_the_time() -> None:
     numbers = itertools.count()
-    assert wait_until(lambda: next(numbers) == 3)
-    assert not wait_until(lambda: False, at_most_s=0.02)
+    assert waiting.wait_until(lambda: next(numbers) == 3)
+    assert not waiting.wait_until(lambda: False, at_most_s=0.02)
 
 
 @pytest.mark.parametrize("area", AREAS)
 def test_faults_can_be_planted_and_name_tests(area: str) -> None:
     for fault in AREAS[area]:
-        planted(fault, (REPOSITORY / fault.file).read_text(encoding="utf-8"))
+        planted(fault, (data.REPOSITORY / fault.file).read_text(encoding="utf-8"))
         for test in fault.tests:
-            assert (REPOSITORY / test.partition("::")[0]).exists(), fault.name
+            assert (data.REPOSITORY / test.partition("::")[0]).exists(), fault.name

@@ -18,7 +18,7 @@ from maplab_py.algorithms.sparsification.sparsify import descriptor_deviations, 
 from maplab_py.errors import EstimationError
 from maplab_py.interop.csv_dataset import CsvExportOptions, export_csv_dataset
 from maplab_py.storage.native import load_map, save_map
-from maplab_py.vimap import VIMap, edits
+from maplab_py.vimap import VIMap, edits, merge, tables
 from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.descriptors import (
     DescriptorBlock,
@@ -26,9 +26,7 @@ from maplab_py.vimap.descriptors import (
     no_blocks,
     types_of,
 )
-from maplab_py.vimap.merge import merge_maps
 from maplab_py.vimap.table import object_column
-from maplab_py.vimap.tables import DescriptorLayout, FrameField
 from tests.support import descriptor_blocks as by_hand
 from tests.support.data import shared_data
 from tests.support.submaps import append_submaps
@@ -79,7 +77,7 @@ def check_marks(vi_map: VIMap, described: Described, *, frames: int) -> None:
     uv = keypoints.uv_px[rows]
     assert np.array_equal(keypoints.position_3d[rows], by_hand.marks_3d(uv))
     assert np.array_equal(keypoints.time_offset_ns[rows, 0], by_hand.marks_ns(uv))
-    bits = FrameField.POSITION_3D | FrameField.TIME_OFFSET
+    bits = tables.FrameField.POSITION_3D | tables.FrameField.TIME_OFFSET
     assert (table.present[own] & bits == bits).all()
     assert check_consistency(vi_map).failure == ""
 
@@ -91,9 +89,9 @@ EDITS: dict[str, Callable[[VIMap], VIMap]] = {
     "landmark merging": lambda m: edits.merge_landmarks(m, np.arange(20), np.arange(20, 40)),
     "observation removal": lambda m: edits.remove_observations(m, m.observations[::7]),
     "sparsification": lambda m: sparsify(m, 100, SparsificationOptions())[0],
-    "merging after": lambda m: merge_maps(m, walk_map())[0],
-    "merging before": lambda m: merge_maps(walk_map(), m)[0],
-    "mission removal": lambda m: edits.remove_missions(merge_maps(walk_map(), m)[0], [0]),
+    "merging after": lambda m: merge.merge_maps(m, walk_map())[0],
+    "merging before": lambda m: merge.merge_maps(walk_map(), m)[0],
+    "mission removal": lambda m: edits.remove_missions(merge.merge_maps(walk_map(), m)[0], [0]),
 }
 
 
@@ -125,10 +123,10 @@ def test_submaps_keep_what_keypoints_carry(folders: dict[int, Path], tmp_path: P
 
 def test_layouts_of_merged_maps_stay_apart(folders: dict[int, Path], tmp_path: Path) -> None:
     legacy = shared_data(SUBMAP.format(4))
-    merged, _ = merge_maps(load_map(folders[3])[0], load_map(legacy)[0], assign_new_ids=True)
+    merged, _ = merge.merge_maps(load_map(folders[3])[0], load_map(legacy)[0], assign_new_ids=True)
     layouts = merged.frames.descriptor_layout
-    assert (layouts == DescriptorLayout.BLOCKS).sum() == len(load_map(folders[3])[0].frames)
-    assert (layouts == DescriptorLayout.LEGACY).sum() == len(load_map(legacy)[0].frames)
+    assert (layouts == tables.DescriptorLayout.BLOCKS).sum() == len(load_map(folders[3])[0].frames)
+    assert (layouts == tables.DescriptorLayout.LEGACY).sum() == len(load_map(legacy)[0].frames)
     save_map(merged, tmp_path / "map")
     bare = {data for _, data in by_hand.described(legacy).values()}
     assert bare <= {

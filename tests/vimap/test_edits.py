@@ -9,13 +9,10 @@ from hypothesis import strategies as st
 
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3
-from maplab_py.vimap import DescriptorBlock, VIMap, edits
+from maplab_py.vimap import DescriptorBlock, VIMap, edits, merge, table, vertex_removal
 from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.edits import merge_landmarks, remove_keypoints, with_p_G
 from maplab_py.vimap.excerpts import cut_by_time, excerpt, mission_maps
-from maplab_py.vimap.merge import merge_maps
-from maplab_py.vimap.table import object_column
-from maplab_py.vimap.vertex_removal import composed_covariance, remove_vertices_counted
 from tests.algorithms.loop_closure.rooms import Walk, make_map
 from tests.simulation.small import simulated
 from tests.support.submaps import append_submaps
@@ -35,7 +32,7 @@ def test_the_example_is_consistent():
 
 def test_removed_vertices_join_imu_and_odometry():
     m = walk_map()
-    after, report = remove_vertices_counted(m, [3, 4, 5, 7])
+    after, report = vertex_removal.remove_vertices_counted(m, [3, 4, 5, 7])
     assert check_consistency(after).errors == ()
     assert report.vertices == 4
     assert len(after.vertices) == len(m.vertices) - 4
@@ -52,7 +49,7 @@ def test_removed_vertices_join_imu_and_odometry():
 
 def test_what_hangs_on_a_removed_vertex_goes_and_is_counted():
     m = walk_map()
-    after, report = remove_vertices_counted(m, [1, 2])
+    after, report = vertex_removal.remove_vertices_counted(m, [1, 2])
     assert report.loop_closure_edges == 1
     assert report.absolute_poses == 1
     gone = np.isin(m.keypoint_vertex, [1, 2])
@@ -63,7 +60,7 @@ def test_what_hangs_on_a_removed_vertex_goes_and_is_counted():
 def test_an_edge_type_that_one_link_lacks_is_dropped():
     m = walk_map()
     m = m.replace(transformation_edges=m.transformation_edges.take(np.arange(1, 11)))
-    after, report = remove_vertices_counted(m, [1])
+    after, report = vertex_removal.remove_vertices_counted(m, [1])
     assert report.transformation_edges_dropped == 1
     assert not np.any(after.transformation_edges.from_vertex == 0)
     assert check_consistency(after).errors == ()
@@ -91,7 +88,7 @@ def test_composed_covariance_is_that_of_samples():
     d_2 = rng.multivariate_normal(np.zeros(6), c_2, n)
     noisy = se3.compose(se3.retract(T_1, d_1), se3.retract(T_2, d_2))
     sampled = np.cov(se3.local(se3.compose(T_1, T_2), noisy).T)
-    expected = composed_covariance(T_1[None], c_1[None], T_2[None], c_2[None])[0]
+    expected = vertex_removal.composed_covariance(T_1[None], c_1[None], T_2[None], c_2[None])[0]
     np.testing.assert_allclose(expected, sampled, atol=0.02 * np.max(np.abs(expected)))
 
 
@@ -167,7 +164,7 @@ def test_any_sequence_of_edits_stays_consistent(operations):
 @pytest.fixture(scope="module")
 def both() -> VIMap:
     first, second = simulated().maps
-    return merge_maps(first, second)[0]
+    return merge.merge_maps(first, second)[0]
 
 
 def test_an_excerpt_is_a_consistent_map_of_its_vertices_and_what_they_observe(both: VIMap) -> None:
@@ -286,7 +283,7 @@ def two_types():  # type: ignore[no-untyped-def]
         for count in vi_map.frames.keypoint_count.tolist()
     ]
     return vi_map.replace(
-        frames=vi_map.frames.replace(descriptor_blocks=object_column(blocks)),
+        frames=vi_map.frames.replace(descriptor_blocks=table.object_column(blocks)),
         keypoints=vi_map.keypoints.replace(descriptor=descriptor),
     )
 

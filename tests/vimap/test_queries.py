@@ -4,18 +4,15 @@ import numpy as np
 import pytest
 
 from maplab_py.errors import UserError
-from maplab_py.vimap import IdIndex, VIMap, random_ids, to_hex
+from maplab_py.vimap import IdIndex, VIMap, comparison, merge, random_ids, statistics, to_hex
 from maplab_py.vimap import ids as ids_module
-from maplab_py.vimap.comparison import is_same
 from maplab_py.vimap.consistency import check_consistency
-from maplab_py.vimap.merge import merge_maps
 from maplab_py.vimap.queries import coobservation_counts, find_mission, observer_counts
-from maplab_py.vimap.statistics import coobservability, map_statistics
 from tests.vimap.builders import walk_map
 
 
 def test_missions_are_found_by_prefix():
-    m, _ = merge_maps(walk_map(), walk_map(seed=1))
+    m, _ = merge.merge_maps(walk_map(), walk_map(seed=1))
     names = [to_hex(row) for row in m.missions.id]
     assert [find_mission(m, name[:12].upper()) for name in names] == [0, 1]
     for wrong in ("", "zz", names[0] + "0"):
@@ -24,7 +21,7 @@ def test_missions_are_found_by_prefix():
 
 
 def test_an_ambiguous_prefix_lists_the_candidates():
-    m, _ = merge_maps(walk_map(), walk_map(seed=1))
+    m, _ = merge.merge_maps(walk_map(), walk_map(seed=1))
     ids = m.missions.id.copy()
     ids[1, 0] = ids[0, 0]
     m = m.replace(missions=m.missions.replace(id=ids))
@@ -36,17 +33,17 @@ def test_a_map_without_missions_says_so():
     with pytest.raises(UserError, match="no missions"):
         find_mission(VIMap(), "0")
     assert check_consistency(VIMap()).failure == ""
-    assert map_statistics(VIMap()).missions == ()
+    assert statistics.map_statistics(VIMap()).missions == ()
 
 
 def test_statistics_add_up():
-    m, _ = merge_maps(walk_map(), walk_map(seed=1))
-    report = map_statistics(m)
+    m, _ = merge.merge_maps(walk_map(), walk_map(seed=1))
+    report = statistics.map_statistics(m)
     assert sum(s.observations for s in report.missions) == len(m.observations)
     assert sum(s.landmarks_good for s in report.missions) == len(m.landmarks)
     assert report.total is not None
     assert report.total.vertices == len(m.vertices)
-    assert len(coobservability(m).clusters) == 2
+    assert len(statistics.coobservability(m).clusters) == 2
     seen = np.diff(m.observation_start) > 0
     assert coobservation_counts(m).trace() == np.count_nonzero(seen)
     np.testing.assert_array_equal(observer_counts(m), np.diff(m.observation_start))
@@ -113,12 +110,12 @@ def test_ids_that_differ_in_one_word_only() -> None:
 
 def test_equal_content_is_the_same_whichever_array_holds_it() -> None:
     a = walk_map(seed=1)
-    assert is_same(a, walk_map(seed=1))
+    assert comparison.is_same(a, walk_map(seed=1))
     v_M = a.vertices.v_M.copy()
-    assert is_same(a, a.replace(vertices=a.vertices.replace(v_M=v_M)))
+    assert comparison.is_same(a, a.replace(vertices=a.vertices.replace(v_M=v_M)))
     v_M[0, 0] = np.nan
     odd = a.replace(vertices=a.vertices.replace(v_M=v_M))
-    assert is_same(odd, odd.replace(vertices=odd.vertices.replace(v_M=v_M.copy())))
+    assert comparison.is_same(odd, odd.replace(vertices=odd.vertices.replace(v_M=v_M.copy())))
 
 
 def test_any_change_makes_another_map() -> None:
@@ -135,4 +132,4 @@ def test_any_change_makes_another_map() -> None:
         a.replace(metadata=metadata),
         a.replace(sensors=type(a.sensors)()),
     ):
-        assert not is_same(a, changed)
+        assert not comparison.is_same(a, changed)

@@ -31,16 +31,9 @@ from maplab_py.algorithms.anchoring.pairs import (
     strongest_pairs,
 )
 from maplab_py.algorithms.landmarks.quality import evaluate_unknown_quality
-from maplab_py.algorithms.loop_closure.alignment_contest import (
-    AlignmentChoice,
-    Contest,
-    listed_alignments,
-)
+from maplab_py.algorithms.loop_closure import alignment_contest, features, record_updates, workflow
 from maplab_py.algorithms.loop_closure.detection import Detection, detect
-from maplab_py.algorithms.loop_closure.features import ProjectionMemory, SearchScope
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.algorithms.loop_closure.record_updates import with_closures
-from maplab_py.algorithms.loop_closure.workflow import describe
 from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.errors import UserError
 from maplab_py.geometry import yaw
@@ -58,9 +51,9 @@ def anchor_missions(
     loop_options: LoopClosureOptions = _LOOPS,
     *,
     missions: I64 | None = None,
-    choice: AlignmentChoice | None = None,
+    choice: alignment_contest.AlignmentChoice | None = None,
     absolute: AbsoluteAnchoringOptions = _ABSOLUTE,
-    projections: ProjectionMemory | None = None,
+    projections: features.ProjectionMemory | None = None,
     progress: Progress = SILENT,
 ) -> tuple[VIMap, AnchoringReport]:
     """Anchor missions of unknown base frame by their absolute poses, then to those of known one.
@@ -94,7 +87,7 @@ def anchor_missions(
     if not known.any() or not wanted.any():
         return vi_map, _nothing_to_do(already_known, by_poses, refusals, known, wanted)
     if options.hypothesis:
-        choice = AlignmentChoice(options.hypothesis)
+        choice = alignment_contest.AlignmentChoice(options.hypothesis)
     judged, notes = evaluate_unknown_quality(vi_map, progress)
     detection = _between_missions(judged, loop_options, choice, projections, progress)
     T_G_M, reached, pairs = _align(
@@ -125,14 +118,14 @@ def anchor_missions(
     if not anchored.any():
         return vi_map, report
     result = _with_base_frames(vi_map, T_G_M, anchored)
-    return with_closures(result, detection.closures, "anchor"), report
+    return record_updates.with_closures(result, detection.closures, "anchor"), report
 
 
 def _between_missions(
     vi_map: VIMap,
     options: LoopClosureOptions,
-    choice: AlignmentChoice | None,
-    projections: ProjectionMemory | None,
+    choice: alignment_contest.AlignmentChoice | None,
+    projections: features.ProjectionMemory | None,
     progress: Progress,
 ) -> Detection:
     return detect(
@@ -142,7 +135,7 @@ def _between_missions(
         only_other_missions=True,
         trust_base_frames=False,
         choice=choice,
-        scope=SearchScope(projections=projections),
+        scope=features.SearchScope(projections=projections),
         progress=progress,
     )
 
@@ -297,7 +290,7 @@ def _why_not(  # type: ignore[no-untyped-def]
         return "; ".join(tried)
     if mine:
         return "aligned only with missions that are not anchored themselves"
-    report = describe(vi_map, detection, loop_options)
+    report = workflow.describe(vi_map, detection, loop_options)
     return report.reason or "no verified closure with any other mission"
 
 
@@ -309,17 +302,17 @@ def _with_base_frames(vi_map: VIMap, T_G_M: F64, anchored: NDArray[np.bool_]) ->
 
 
 def described_hypotheses(
-    contests: Sequence[Contest], names: Sequence[str]
+    contests: Sequence[alignment_contest.Contest], names: Sequence[str]
 ) -> tuple[AlignmentHypothesis, ...]:
     """Describe the alignments of all pairs of missions that have several or none that wins."""
     return tuple(
         _describe_hypothesis(number, contests[i], k, names)
-        for number, (i, k) in enumerate(listed_alignments(contests), start=1)
+        for number, (i, k) in enumerate(alignment_contest.listed_alignments(contests), start=1)
     )
 
 
 def _describe_hypothesis(
-    number: int, contest: Contest, k: int, names: Sequence[str]
+    number: int, contest: alignment_contest.Contest, k: int, names: Sequence[str]
 ) -> AlignmentHypothesis:
     alignments = contest.pair.alignments
     alignment = alignments[k]
@@ -343,7 +336,7 @@ def _describe_hypothesis(
     )
 
 
-def _outcome(contest: Contest, k: int) -> str:
+def _outcome(contest: alignment_contest.Contest, k: int) -> str:
     if contest.winner < 0:
         return "undecided"
     if k == contest.winner:
@@ -374,7 +367,9 @@ def place_mission(vi_map: VIMap, mission: int, T_G_M: F64) -> tuple[VIMap, Ancho
     return vi_map.replace(baseframes=frames), report
 
 
-def choice_near(vi_map: VIMap, mission: int, to: int, T_G_M: F64) -> AlignmentChoice:
+def choice_near(
+    vi_map: VIMap, mission: int, to: int, T_G_M: F64
+) -> alignment_contest.AlignmentChoice:
     """Return the choice of the alignment of two missions that is near a pose (4,) of the first.
 
     Raises:
@@ -389,8 +384,8 @@ def choice_near(vi_map: VIMap, mission: int, to: int, T_G_M: F64) -> AlignmentCh
     T_G_to = yaw.from_pose(vi_map.T_G_M)[to]
     T_to_M = yaw.compose(yaw.inverse(T_G_to), T_G_M)
     if mission < to:
-        return AlignmentChoice(missions=(mission, to), T_B_A=T_to_M)
-    return AlignmentChoice(missions=(to, mission), T_B_A=yaw.inverse(T_to_M))
+        return alignment_contest.AlignmentChoice(missions=(mission, to), T_B_A=T_to_M)
+    return alignment_contest.AlignmentChoice(missions=(to, mission), T_B_A=yaw.inverse(T_to_M))
 
 
 def _require_unknown(vi_map: VIMap, mission: int) -> None:

@@ -11,17 +11,14 @@ import numpy as np
 
 from maplab_py.algorithms.cloud_registration.options import CloudClosureOptions
 from maplab_py.algorithms.cloud_registration.registration import PreparedCloud, prepare_cloud
-from maplab_py.algorithms.loop_closure.closure_record import read_record
-from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
+from maplab_py.algorithms.loop_closure import closure_record, closure_table
 from maplab_py.algorithms.loop_closure.reports import Verdict
 from maplab_py.array_types import F64, I64, Mask, NDArray
 from maplab_py.errors import MapError, UserError
-from maplab_py.geometry import se3
-from maplab_py.geometry.interpolation import interpolate_poses, nearest_rows
+from maplab_py.geometry import interpolation, se3
 from maplab_py.interop.ply import parse_ply
 from maplab_py.storage.resources.store import ResourceStore
-from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap, as_keys, to_hex
-from maplab_py.vimap.queries import mission_sensor_id, resources_of
+from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap, as_keys, queries, to_hex
 
 CLOUD_TYPES = (16, 17, 21)
 """Resource types of clouds: plain, with colours, with intensities."""
@@ -59,7 +56,7 @@ def map_scans(vi_map: VIMap, missions: I64, every_nth: int = 1) -> Scans:
         MapError: A sensor has no extrinsics.
     """
     table = vi_map.resources
-    chosen = resources_of(vi_map, CLOUD_TYPES, missions)
+    chosen = queries.resources_of(vi_map, CLOUD_TYPES, missions)
     chosen &= table.owner_kind == ResourceOwner.SENSOR
     rows = np.flatnonzero(chosen)
     keys = as_keys(table.sensor_id[rows])
@@ -102,11 +99,11 @@ def _of_sensor(vi_map: VIMap, rows: I64) -> Scans:
     if not len(rows):
         none = np.zeros(0, dtype=np.int64)
         return Scans(none, none, none, none, empty, empty)
-    T_G_I, _ = interpolate_poses(times, vi_map.T_G_I[first:last], stamp)
-    imu_id = mission_sensor_id(vi_map, mission, MissionSensor.IMU)
+    T_G_I, _ = interpolation.interpolate_poses(times, vi_map.T_G_I[first:last], stamp)
+    imu_id = queries.mission_sensor_id(vi_map, mission, MissionSensor.IMU)
     T_I_S = vi_map.sensors.T_I_S(imu_id, to_hex(table.sensor_id[rows[0]]))
     T_G_S = se3.compose(T_G_I, T_I_S)
-    vertex = first + nearest_rows(times, stamp)
+    vertex = first + interpolation.nearest_rows(times, stamp)
     return Scans(
         rows,
         np.full(len(rows), mission, dtype=np.int64),
@@ -176,8 +173,8 @@ def pairs_from_closures(vi_map: VIMap, scans: Scans, options: CloudClosureOption
     Raises:
         UserError: No accepted closure is recorded.
     """
-    closures = read_record(vi_map).closures
-    closures = closures.take(closures.verdict == VERDICTS.index(Verdict.ACCEPTED))
+    closures = closure_record.read_record(vi_map).closures
+    closures = closures.take(closures.verdict == closure_table.VERDICTS.index(Verdict.ACCEPTED))
     if not len(closures):
         raise UserError(
             "--lidar_lc_from_closures: the map records no accepted closure (see: lc)",
@@ -233,7 +230,7 @@ def _in_sequence(scans: Scans, options: CloudClosureOptions) -> tuple[I64, I64]:
         rows = rows[np.argsort(scans.time_ns[rows], kind="stable")]
         time_ns = scans.time_ns[rows]
         for wanted_ns in (gap_ns, 2 * gap_ns):
-            earlier = nearest_rows(time_ns, time_ns - wanted_ns)
+            earlier = interpolation.nearest_rows(time_ns, time_ns - wanted_ns)
             is_near = np.abs(time_ns - time_ns[earlier] - wanted_ns) < gap_ns // 2
             query.append(rows[is_near])
             place.append(rows[earlier[is_near]])
@@ -267,5 +264,5 @@ def _cloud_of_vertex(vi_map: VIMap, scans: Scans, vertex: I64) -> I64:
         clouds = clouds[np.argsort(scans.time_ns[clouds], kind="stable")]
         here = np.flatnonzero(mission == row)
         stamp = vi_map.vertices.timestamp_ns[vertex[here]]
-        result[here] = clouds[nearest_rows(scans.time_ns[clouds], stamp)]
+        result[here] = clouds[interpolation.nearest_rows(scans.time_ns[clouds], stamp)]
     return result

@@ -24,17 +24,9 @@ from maplab_py.algorithms.cloud_registration.scans import (
     pairs_everywhere,
     pairs_from_closures,
 )
-from maplab_py.algorithms.loop_closure.closure_table import (
-    VERDICTS,
-    Closures,
-    closure_edges,
-    closure_ids,
-)
-from maplab_py.algorithms.loop_closure.gates import judge, measure
+from maplab_py.algorithms.loop_closure import closure_table, gates, record_updates, workflow
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.algorithms.loop_closure.record_updates import with_closures
 from maplab_py.algorithms.loop_closure.reports import Verdict
-from maplab_py.algorithms.loop_closure.workflow import missions_joined
 from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.geometry import se3, so3
 from maplab_py.progress import SILENT, Progress
@@ -71,7 +63,7 @@ def close_cloud_loops(
     pairs = _pairs(vi_map, scans, options)
     matches = register_pairs(vi_map, map_folder, scans, pairs, options, progress)
     closures = judge_matches(vi_map, scans, matches, options)
-    edges = closure_edges(
+    edges = closure_table.closure_edges(
         closures,
         LoopClosureOptions(
             edge_covariance_scaler=options.covariance_scaler,
@@ -82,7 +74,7 @@ def close_cloud_loops(
     kept = old.take(IdIndex(edges.id).rows(old.id) < 0)
     result = vi_map.replace(loop_closure_edges=LoopClosureEdges.concatenate([kept, edges]))
     used = closures.accepted & (IdIndex(edges.id).rows(closures.id) >= 0)
-    result = with_closures(result, closures, "edge", used=used)
+    result = record_updates.with_closures(result, closures, "edge", used=used)
     return result, _report(vi_map, scans, pairs, matches, closures, len(edges))
 
 
@@ -99,7 +91,7 @@ def _report(
     scans: Scans,
     pairs: CloudPairs,
     matches: CloudMatches,
-    closures: Closures,
+    closures: closure_table.Closures,
     edges: int,
 ) -> CloudClosureReport:
     accepted = closures.accepted
@@ -109,7 +101,7 @@ def _report(
         accepted=int(np.count_nonzero(accepted)),
         edges_added=edges,
         refused=closures.refused_by_reason(),
-        missions_joined=missions_joined(vi_map, closures),
+        missions_joined=workflow.missions_joined(vi_map, closures),
         notes=_notes(pairs, matches),
     )
     if not edges:
@@ -224,7 +216,7 @@ def _matches(
 
 def judge_matches(
     vi_map: VIMap, scans: Scans, matches: CloudMatches, options: CloudClosureOptions
-) -> Closures:
+) -> closure_table.Closures:
     """Return registered pairs as closures of the vertices nearest in time, with verdicts.
 
     The gates of the registration come first. What passes is judged like closures of images: removed by
@@ -234,18 +226,22 @@ def judge_matches(
     query, place = scans.vertex[matches.query], scans.vertex[matches.place]
     is_known = vi_map.baseframes.is_known[vi_map.missions.baseframe]
     measured = dataclasses.replace(
-        measure(vi_map, query, place, solutions, is_known), verdict=_fit_verdicts(matches, options)
+        gates.measure(vi_map, query, place, solutions, is_known),
+        verdict=_fit_verdicts(matches, options),
     )
     T_M_I, thresholds = solutions.T_M_I, _closure_options(options)
-    judged, _ = judge(vi_map, query, place, T_M_I, measured, thresholds)
+    judged, _ = gates.judge(vi_map, query, place, T_M_I, measured, thresholds)
     alone = judged.accepted & (
         judged.support < options.min_support
     )  # inliers do not replace it here
-    judged.verdict[alone], judged.difference[alone] = VERDICTS.index(Verdict.NO_SUPPORT), 0.0
+    judged.verdict[alone], judged.difference[alone] = (
+        closure_table.VERDICTS.index(Verdict.NO_SUPPORT),
+        0.0,
+    )
     none = np.zeros(0, dtype=np.int64)
-    return Closures(
+    return closure_table.Closures(
         **vars(judged),
-        id=closure_ids(vi_map, query, place) ^ _ID_OF_CLOUDS,
+        id=closure_table.closure_ids(vi_map, query, place) ^ _ID_OF_CLOUDS,
         query_vertex=query,
         place_vertex=place,
         T_M_I=T_M_I,
@@ -260,7 +256,7 @@ def judge_matches(
 
 def _fit_verdicts(matches: CloudMatches, options: CloudClosureOptions) -> NDArray[np.int8]:
     """Return the codes (N,) of the first gate of the registration that a pair fails."""
-    accepted = VERDICTS.index(Verdict.ACCEPTED)
+    accepted = closure_table.VERDICTS.index(Verdict.ACCEPTED)
     verdict = np.full(len(matches), accepted, dtype=np.int8)
     for failed, reason in (
         (matches.overlap < options.min_overlap, Verdict.SMALL_OVERLAP),
@@ -268,7 +264,7 @@ def _fit_verdicts(matches: CloudMatches, options: CloudClosureOptions) -> NDArra
         (matches.conflict > options.max_conflict, Verdict.BAD_FIT),
         (matches.constraint < options.min_constraint, Verdict.DEGENERATE),
     ):
-        verdict[failed & (verdict == accepted)] = VERDICTS.index(reason)
+        verdict[failed & (verdict == accepted)] = closure_table.VERDICTS.index(reason)
     return verdict
 
 

@@ -12,8 +12,7 @@ from maplab_py.errors import MapError, UserError
 from maplab_py.interop.ply import PlyCloud, encode_ply
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
-from maplab_py.sensors import Camera
-from maplab_py.sensors.projection import back_project, is_inside_image, project
+from maplab_py.sensors import Camera, projection
 from maplab_py.storage.resources.new import NewResources
 from maplab_py.vimap import ResourceOwner, VIMap, resources_of
 
@@ -35,7 +34,7 @@ class CloudMaker:
     def __init__(self, camera: Camera) -> None:
         """Compute the rays of all pixels."""
         u, v = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
-        rays, valid = back_project(camera, np.stack([u, v], axis=-1))
+        rays, valid = projection.back_project(camera, np.stack([u, v], axis=-1))
         self._valid = valid & (rays[..., 2] > 0.0)
         z = np.where(self._valid, rays[..., 2], 1.0)
         self._points = rays / z[..., None]
@@ -60,10 +59,10 @@ def _colours(pixels: Any) -> U8:
 
 def depth_of_cloud(camera: Camera, p_C: F64) -> F32:
     """Return the depth map (H, W) [m] of points (N, 3) in a camera's frame: the nearest in each pixel."""
-    uv, visible = project(camera, p_C)
+    uv, visible = projection.project(camera, p_C)
     pixels = np.round(uv[visible]).astype(np.int64)
     z = p_C[visible, 2]
-    inside = is_inside_image(camera, pixels) & (z > 0.0)
+    inside = projection.is_inside_image(camera, pixels) & (z > 0.0)
     depth = np.full((camera.height_px, camera.width_px), np.inf, dtype=np.float32)
     np.minimum.at(depth, (pixels[inside, 1], pixels[inside, 0]), z[inside].astype(np.float32))
     return np.where(np.isfinite(depth), depth, np.float32(0.0))

@@ -19,8 +19,7 @@ from maplab_py.interop import mvs
 from maplab_py.output_files import check_writable, write_bytes, write_text
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
-from maplab_py.sensors import Camera
-from maplab_py.sensors.projection import back_project
+from maplab_py.sensors import Camera, projection
 from maplab_py.vimap import LandmarkQuality, ResourceOwner, VIMap, resources_of, to_hex
 
 _GREY = 128
@@ -303,7 +302,7 @@ class UndistortedViews:
         camera_of_row = self.camera_of_view[view]
         for number, camera in enumerate(self.cameras):
             rows = np.flatnonzero(camera_of_row == number)
-            rays, valid = back_project(camera, uv_px[rows])
+            rays, valid = projection.back_project(camera, uv_px[rows])
             pinhole = self.pinholes[number]
             u, v, in_front = pinhole.pixels(rays)
             result[rows] = np.stack([u, v], axis=1)

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from maplab_py.algorithms.dense.fusion import load_grids
-from maplab_py.algorithms.dense.grid import Mesh
+from maplab_py.algorithms.dense import fusion, grid
 from maplab_py.algorithms.dense.options import MESH_MIN_WEIGHT
 from maplab_py.algorithms.dense.resources import DEPTH_MAPS, FrameImages, FrameResources
 from maplab_py.array_types import F32, F64, I64, U8
@@ -34,7 +33,7 @@ def map_mesh(
     map_folder: Path,
     missions: I64 | None = None,
     min_weight: float = MESH_MIN_WEIGHT,
-) -> tuple[Mesh, int]:
+) -> tuple[grid.Mesh, int]:
     """Return the surface of the grids of missions in G, and the number of grids.
 
     Args:
@@ -48,7 +47,7 @@ def map_mesh(
         MapError: A file is missing or damaged.
         EstimationError: The grids have no surface of this weight.
     """
-    grids = load_grids(vi_map, map_folder, missions)
+    grids = fusion.load_grids(vi_map, map_folder, missions)
     points, faces, count = [], [], 0
     for mission, stored in grids:
         mesh = stored.grid.mesh(min_weight)
@@ -59,7 +58,7 @@ def map_mesh(
         raise EstimationError(
             f"the grid has no surface of weight {min_weight:g}: lower --dense_tsdf_mesh_min_weight"
         )
-    return Mesh(np.concatenate(points), np.concatenate(faces)), len(grids)
+    return grid.Mesh(np.concatenate(points), np.concatenate(faces)), len(grids)
 
 
 def write_map_mesh(

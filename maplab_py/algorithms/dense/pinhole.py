@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from maplab_py.array_types import F32, F64, Mask
-from maplab_py.sensors import Camera
-from maplab_py.sensors.projection import back_project, is_inside_image, project
+from maplab_py.sensors import Camera, projection
 
 _MAX_TANGENT = 1.6
 """Largest tangent of the angle between a ray of a perspective image and its axis (58 degrees)."""
@@ -65,7 +64,7 @@ def inscribed(views: list[tuple[Camera, F64]], width_px: int, height_px: int) ->
                 edge = np.empty((_BORDER_SAMPLES, 2))
                 edge[:, 1 - axis] = steps[:, 0] * size[1 - axis]
                 edge[:, axis] = side * size[axis]
-                rays, valid = back_project(camera, edge)
+                rays, valid = projection.back_project(camera, edge)
                 rays = rays[valid] @ R_P_C.T
                 rays = rays[rays[:, 2] > 0.1]
                 if not len(rays):
@@ -129,8 +128,8 @@ class ImageMap:
 
 def map_to_camera(pinhole: Pinhole, camera: Camera, R_C_P: F64) -> ImageMap:
     """Return where the pixels of a perspective image lie in a camera's distorted image."""
-    uv, visible = project(camera, pinhole.rays() @ R_C_P.T)
-    visible = visible & is_inside_image(camera, uv)
+    uv, visible = projection.project(camera, pinhole.rays() @ R_C_P.T)
+    visible = visible & projection.is_inside_image(camera, uv)
     return ImageMap.of(uv[..., 0], uv[..., 1], visible)  # type: ignore[arg-type]
 
 
@@ -142,7 +141,7 @@ def map_from_camera(pinhole: Pinhole, camera: Camera, R_C_P: F64) -> tuple[Image
         becomes one along the axis of the camera.
     """
     u, v = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
-    rays, valid = back_project(camera, np.stack([u, v], axis=-1))
+    rays, valid = projection.back_project(camera, np.stack([u, v], axis=-1))
     p_P = rays @ R_C_P
     u_P, v_P, in_front = pinhole.pixels(p_P)
     inside = (u_P >= 0) & (v_P >= 0) & (u_P < pinhole.width_px) & (v_P < pinhole.height_px)
@@ -167,7 +166,7 @@ def undistorted(camera: Camera) -> tuple[Pinhole, ImageMap]:
             for pair in ((steps, ends), (steps, ends + 1.0), (ends, steps), (ends + 1.0, steps))
         ]
     )
-    rays, valid = back_project(camera, border * size)
+    rays, valid = projection.back_project(camera, border * size)
     x = rays[:, :2] / np.maximum(rays[:, 2:], 1e-3)
     x = np.where(valid[:, None], np.clip(x, -_MAX_TANGENT, _MAX_TANGENT), 0.0)
     low, high = x.min(axis=0), x.max(axis=0)

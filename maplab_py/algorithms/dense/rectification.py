@@ -12,8 +12,7 @@ import numpy as np
 from maplab_py.algorithms.dense import pinhole as pinholes
 from maplab_py.array_types import F32, F64, Mask
 from maplab_py.geometry import se3
-from maplab_py.sensors import CameraRig
-from maplab_py.sensors.projection import is_inside_image, project
+from maplab_py.sensors import CameraRig, projection
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -81,8 +80,8 @@ def _unsuitable(rig: CameraRig, a: int, b: int, min_baseline_m: float, max_angle
         return f"angle {angle:.3f} rad exceeds --dense_stereo_max_angle_between_opt_axes"
     for first, second in ((a, b), (b, a)):
         direction = se3.relative(rig.T_B_C[first], rig.T_B_C[second])[4:] / baseline_m
-        uv, visible = project(rig.cameras[first], np.stack([direction, -direction]))
-        if np.any(visible & is_inside_image(rig.cameras[first], uv)):
+        uv, visible = projection.project(rig.cameras[first], np.stack([direction, -direction]))
+        if np.any(visible & projection.is_inside_image(rig.cameras[first], uv)):
             return f"the epipole is inside the image of camera {first}"
     return ""
 

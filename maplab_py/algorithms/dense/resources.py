@@ -12,8 +12,7 @@ from maplab_py.geometry import se3
 from maplab_py.interop.images import as_8_bits, as_grey, bits_of, sampled
 from maplab_py.sensors import Camera, CameraRig
 from maplab_py.storage.resources.store import ResourceStore
-from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap, to_hex
-from maplab_py.vimap.queries import mission_sensor_id, resources_of
+from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap, queries, to_hex
 
 IMAGES = (0, 4)
 """Resource types of recorded images: grey, colour."""
@@ -27,7 +26,7 @@ _MM = np.float32(1e-3)
 
 def mission_rig(vi_map: VIMap, mission: int) -> CameraRig | None:
     """Return the camera rig of a mission (row), None when it has none."""
-    rig_id = mission_sensor_id(vi_map, mission, MissionSensor.NCAMERA)
+    rig_id = queries.mission_sensor_id(vi_map, mission, MissionSensor.NCAMERA)
     return vi_map.sensors.camera_rig(rig_id) if rig_id else None
 
 
@@ -85,8 +84,8 @@ class FrameResources:
         return cameras[index], T_I_C[index]
 
     def _mission_cameras(self, mission: int) -> tuple[tuple[Camera, ...], F64]:
-        rig_id = mission_sensor_id(self.vi_map, mission, MissionSensor.NCAMERA)
-        imu_id = mission_sensor_id(self.vi_map, mission, MissionSensor.IMU)
+        rig_id = queries.mission_sensor_id(self.vi_map, mission, MissionSensor.NCAMERA)
+        imu_id = queries.mission_sensor_id(self.vi_map, mission, MissionSensor.IMU)
         if not rig_id:
             return (), np.zeros((0, 7))
         sensors = self.vi_map.sensors
@@ -114,7 +113,7 @@ class FrameImages:
         self._store = ResourceStore(vi_map, map_folder)
         table = vi_map.resources
         rows = np.flatnonzero(
-            resources_of(vi_map, IMAGES) & (table.owner_kind == ResourceOwner.FRAME)
+            queries.resources_of(vi_map, IMAGES) & (table.owner_kind == ResourceOwner.FRAME)
         )
         rows = rows[np.argsort(table.type[rows], kind="stable")[::-1]]
         self._row = dict(zip(table.owner[rows].tolist(), rows.tolist(), strict=True))

@@ -8,11 +8,8 @@ import numpy as np
 from maplab_py.algorithms.evaluation.reports import LocalizationErrors
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import EstimationError
-from maplab_py.geometry import se3
-from maplab_py.geometry.alignment import umeyama
-from maplab_py.geometry.interpolation import interpolate_poses
-from maplab_py.interop.text_table import read_text_table
-from maplab_py.interop.trajectories import LOCALIZED, Trajectory, trajectory_of_table
+from maplab_py.geometry import alignment, interpolation, se3
+from maplab_py.interop import text_table, trajectories
 from maplab_py.vimap import VIMap
 
 _MAX_GAP_NS = 500_000_000
@@ -36,11 +33,11 @@ def read_localized(path: Path) -> LocalizedTrajectory:
     Raises:
         MapError: The file cannot be read or is not a trajectory.
     """
-    table = read_text_table(path)
-    trajectory, rows = trajectory_of_table(table)
+    table = text_table.read_text_table(path)
+    trajectory, rows = trajectories.trajectory_of_table(table)
     is_localized = np.ones(len(trajectory), dtype=np.bool_)
-    if LOCALIZED in table.header:
-        is_localized = table.values[rows, table.header.index(LOCALIZED) - 1] > 0.0
+    if trajectories.LOCALIZED in table.header:
+        is_localized = table.values[rows, table.header.index(trajectories.LOCALIZED) - 1] > 0.0
     return LocalizedTrajectory(
         str(path),
         trajectory.times_ns,
@@ -50,13 +47,13 @@ def read_localized(path: Path) -> LocalizedTrajectory:
     )
 
 
-def alignment_of_map(vi_map: VIMap, truth: Trajectory) -> F64:
+def alignment_of_map(vi_map: VIMap, truth: trajectories.Trajectory) -> F64:
     """Return T_R_G (7,) that puts the vertices of a map where the ground truth has them.
 
     Raises:
         EstimationError: Fewer than three vertices lie in the span of the truth.
     """
-    poses, inside = interpolate_poses(
+    poses, inside = interpolation.interpolate_poses(
         truth.times_ns, truth.T_R_B, vi_map.vertices.timestamp_ns, max_gap_ns=_MAX_GAP_NS
     )
     if np.count_nonzero(inside) < _MIN_PAIRS:
@@ -64,12 +61,12 @@ def alignment_of_map(vi_map: VIMap, truth: Trajectory) -> F64:
             f"{truth.source}: fewer than {_MIN_PAIRS} vertices of the map lie in its time span: give "
             "the ground truth of the recordings that the map was made of"
         )
-    T_R_G, _ = umeyama(poses[inside, 4:], vi_map.T_G_I[inside, 4:])
+    T_R_G, _ = alignment.umeyama(poses[inside, 4:], vi_map.T_G_I[inside, 4:])
     return T_R_G
 
 
 def localization_errors(
-    localized: LocalizedTrajectory, truth: Trajectory, T_R_G: F64
+    localized: LocalizedTrajectory, truth: trajectories.Trajectory, T_R_G: F64
 ) -> LocalizationErrors:
     """Compare the frames of a file with ground truth in a frame R.
 
@@ -81,7 +78,7 @@ def localization_errors(
     Raises:
         EstimationError: No frame lies in the span of the truth.
     """
-    poses, known = interpolate_poses(
+    poses, known = interpolation.interpolate_poses(
         truth.times_ns, truth.T_R_B, localized.times_ns, max_gap_ns=_MAX_GAP_NS
     )
     if not known.any():

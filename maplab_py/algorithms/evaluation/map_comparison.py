@@ -7,11 +7,8 @@ import numpy as np
 from maplab_py.algorithms.evaluation.reports import Difference, MapComparisonReport, RowCounts
 from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.geometry import se3
-from maplab_py.sensors import Camera, CameraRig
-from maplab_py.sensors.sensor_set import Sensor
-from maplab_py.vimap import IdArray, VIMap, as_keys, is_valid
-from maplab_py.vimap.comparison import is_same
-from maplab_py.vimap.sensor_merge import same_calibration
+from maplab_py.sensors import Camera, CameraRig, sensor_set
+from maplab_py.vimap import IdArray, VIMap, as_keys, comparison, is_valid, sensor_merge
 
 _TABLES = (
     ("missions", "missions"),
@@ -134,10 +131,10 @@ def _sensors(first: VIMap, second: VIMap) -> tuple[str, ...]:
     return tuple(name for name in common if not _same_sensor(a[name], b[name]))
 
 
-def _same_sensor(a: Sensor, b: Sensor) -> bool:
+def _same_sensor(a: sensor_set.Sensor, b: sensor_set.Sensor) -> bool:
     """Return whether two sensors are equal up to the rounding of files."""
     if not (isinstance(a, CameraRig) and isinstance(b, CameraRig)):
-        return same_calibration(a, b)
+        return sensor_merge.same_calibration(a, b)
     if len(a.cameras) != len(b.cameras) or not np.allclose(
         a.T_B_C, b.T_B_C, rtol=0, atol=_ROUNDING
     ):
@@ -163,4 +160,4 @@ def _same_camera(a: Camera, b: Camera) -> bool:
 def _is_identical(first: VIMap, second: VIMap) -> bool:
     """Return whether all tables and sensors are equal; metadata may differ."""
     names = [field.name for field in dataclasses.fields(VIMap) if field.name != "metadata"]
-    return all(is_same(getattr(first, name), getattr(second, name)) for name in names)
+    return all(comparison.is_same(getattr(first, name), getattr(second, name)) for name in names)

@@ -4,13 +4,11 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.algorithms.evaluation import pose_errors, reports
+from maplab_py.algorithms.evaluation import plausibility, pose_errors, reports
 from maplab_py.algorithms.evaluation.options import DELTA_UNITS, TrajectoryEvaluationOptions
-from maplab_py.algorithms.evaluation.plausibility import clock_offset_ns, orientation_hint
 from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.errors import EstimationError
-from maplab_py.geometry import se3, so3
-from maplab_py.geometry.interpolation import interpolate_poses, nearest_rows
+from maplab_py.geometry import interpolation, se3, so3
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap, ids
@@ -64,7 +62,7 @@ def evaluate_trajectory(
     T_R_I, scale = pose_errors.align(T_R_B, T_G_I, options.alignment)
     hint, body_rotation_deg = clock_hint(vi_map, every, ground_truth, options), None
     if ground_truth.has_orientation:
-        hint = hint or orientation_hint(T_R_B[:, :4], T_R_I[:, :4])
+        hint = hint or plausibility.orientation_hint(T_R_B[:, :4], T_R_I[:, :4])
         q_B_I = pose_errors.mean_rotation(so3.multiply(so3.inverse(T_R_B[:, :4]), T_R_I[:, :4]))
         body_rotation_deg = float(np.degrees(np.linalg.norm(so3.log(q_B_I))))
         if options.align_body_frame:
@@ -147,7 +145,7 @@ def clock_hint(
     error_m = error_at(0)
     if error_m * seconds < _LEAST_CLOCK_S * path_m:
         return ""
-    result = clock_offset_ns(
+    result = plausibility.clock_offset_ns(
         ground_truth.times_ns + round(given_s * 1e9),
         ground_truth.T_R_B,
         stamps[longest],
@@ -182,14 +180,14 @@ def match(
     stamps, first = np.unique(ground_truth.times_ns, return_index=True)
     stamps = stamps + round(options.time_offset_s * 1e9)
     poses = ground_truth.T_R_B[first]
-    nearest = nearest_rows(stamps, times_ns)
+    nearest = interpolation.nearest_rows(stamps, times_ns)
     tolerance_ns = round(options.max_time_difference_s * 1e9)
     is_near = np.abs(stamps[nearest] - times_ns) <= tolerance_ns
     if not options.interpolate:
         return poses[nearest], is_near
     usual_step_ns = int(np.median(np.diff(stamps))) if len(stamps) > 1 else 0
     gap_ns = max(2 * tolerance_ns, _GAP_STEPS * usual_step_ns, 1)
-    T_R_B, inside = interpolate_poses(stamps, poses, times_ns, max_gap_ns=gap_ns)
+    T_R_B, inside = interpolation.interpolate_poses(stamps, poses, times_ns, max_gap_ns=gap_ns)
     return T_R_B, is_near & inside
 
 

@@ -6,8 +6,7 @@ import numpy as np
 
 from maplab_py.array_types import F64
 from maplab_py.errors import EstimationError
-from maplab_py.geometry import se3, so3
-from maplab_py.geometry.alignment import align_yaw_position
+from maplab_py.geometry import alignment, se3, so3
 from maplab_py.vimap import VIMap
 
 _ITERATIONS = 50
@@ -37,11 +36,11 @@ def robust_yaw_position(p_G: F64, p_M: F64) -> F64:
         EstimationError: There are fewer than two, or they have no horizontal extent.
     """
     weight = np.ones(len(p_G))
-    T_G_M = align_yaw_position(p_G, p_M)
+    T_G_M = alignment.align_yaw_position(p_G, p_M)
     for _ in range(_ITERATIONS):
         error_m = np.linalg.norm(p_G - se3.transform(T_G_M, p_M), axis=1)
         weight = 1.0 / np.maximum(error_m, _LEAST_ERROR_M)
-        before, T_G_M = T_G_M, align_yaw_position(p_G, p_M, weight)
+        before, T_G_M = T_G_M, alignment.align_yaw_position(p_G, p_M, weight)
         if np.max(np.abs(T_G_M - before)) < _CONVERGED:
             break
     return T_G_M

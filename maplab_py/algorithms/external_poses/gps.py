@@ -12,8 +12,7 @@ from maplab_py.algorithms.external_poses import alignment, trajectories
 from maplab_py.algorithms.external_poses.options import GpsOptions
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError, UserError
-from maplab_py.geometry import se3, so3
-from maplab_py.geometry.interpolation import interpolate_poses, interpolate_vectors
+from maplab_py.geometry import interpolation, se3, so3
 from maplab_py.interop.gps import GpsTrack, east_north_up_m
 from maplab_py.sensors import OtherSensor
 from maplab_py.sensors.yaml_entry import Entry
@@ -81,7 +80,7 @@ def attach_fixes(
     T_I_S = se3.make(se3.identity()[:4], np.array(options.lever_arm))
     T_M_S = se3.compose(vi_map.vertices.T_M_I[rows], T_I_S)
     p_G = east_north_up_m(track, origin)[fixes]
-    p_M = interpolate_poses(stamps, T_M_S, times[fixes])[0][:, 4:]
+    p_M = interpolation.interpolate_poses(stamps, T_M_S, times[fixes])[0][:, 4:]
     T_G_M = alignment.robust_yaw_position(p_G, p_M) if options.align else vi_map.T_G_M[mission]
     error_m = np.linalg.norm(p_G - se3.transform(T_G_M, p_M), axis=1)
     movement = alignment.Movement(0.0, 0.0)
@@ -139,7 +138,7 @@ def _matches(stamps: I64, times: I64, options: GpsOptions, source: str) -> tuple
         raise UserError(f"{source}: the mission has fewer than two vertices to attach positions to")
     gap_ns = round(options.max_gap_s * 1e9)
     zeros = np.zeros((len(stamps), 1))
-    covered = interpolate_vectors(stamps, zeros, times, max_gap_ns=gap_ns)[1]
+    covered = interpolation.interpolate_vectors(stamps, zeros, times, max_gap_ns=gap_ns)[1]
     fixes = np.flatnonzero(covered)
     place = trajectories.nearest(stamps, times[fixes])
     order = np.lexsort((np.abs(times[fixes] - stamps[place]), place))

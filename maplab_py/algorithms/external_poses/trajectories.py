@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from maplab_py.algorithms.evaluation import plausibility, trajectory_evaluation
 from maplab_py.algorithms.evaluation.options import TrajectoryEvaluationOptions
-from maplab_py.algorithms.evaluation.plausibility import motion_hint, orientation_hint
-from maplab_py.algorithms.evaluation.trajectory_evaluation import clock_hint
 from maplab_py.algorithms.external_poses import alignment
 from maplab_py.algorithms.external_poses.options import TrajectoryOptions
 from maplab_py.array_types import F64, I64, U64, Mask
@@ -70,7 +69,7 @@ def as_absolute_poses(
         T_G_M = alignment.robust_yaw_position(T_G_S[:, 4:], T_M_S[:, 4:])
     T_G_S_map = se3.compose(T_G_M, T_M_S)
     if trajectory.has_orientation:
-        hint = orientation_hint(T_G_S[:, :4], T_G_S_map[:, :4], is_mounted=True)
+        hint = plausibility.orientation_hint(T_G_S[:, :4], T_G_S_map[:, :4], is_mounted=True)
         if hint and not clock_note(vi_map, mission, trajectory, options):
             raise EstimationError(f"{trajectory.source}: {hint}")
         alignment.check_vertical(T_G_S[:, :4], T_M_S[:, :4], trajectory.source)
@@ -115,7 +114,7 @@ def as_odometry(
     words = content_words(vi_map, mission, "odometry", trajectory.times_ns, trajectory.T_R_B)
     T_I_S = mounting(vi_map, mission, options.sensor_id)
     q_M_S = se3.compose(vi_map.vertices.T_M_I[rows[covered]], T_I_S)[:, :4]
-    apart_deg, hint = motion_hint(T_R_S[covered, :4], q_M_S)
+    apart_deg, hint = plausibility.motion_hint(T_R_S[covered, :4], q_M_S)
     if hint and not clock_note(vi_map, mission, trajectory, options):
         raise EstimationError(f"{trajectory.source}: {hint}")
     notes = []
@@ -186,7 +185,7 @@ def clock_note(
     rows = np.arange(vi_map.vertex_start[mission], vi_map.vertex_start[mission + 1])
     as_read = shifted(trajectory, -options.time_offset_s)
     evaluation = TrajectoryEvaluationOptions(time_offset_s=options.time_offset_s)
-    return clock_hint(vi_map, rows, as_read, evaluation)
+    return trajectory_evaluation.clock_hint(vi_map, rows, as_read, evaluation)
 
 
 def nearest(stamps: I64, times: I64) -> I64:

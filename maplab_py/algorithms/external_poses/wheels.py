@@ -15,12 +15,10 @@ from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.geometry.interpolation import interpolate_poses
 from maplab_py.interop.wheel_odometry import WheelTrack
-from maplab_py.sensors import OtherSensor
+from maplab_py.sensors import OtherSensor, yaml_entry
 from maplab_py.sensors.wheels import WHEEL_ODOMETRY, wheel_scale
-from maplab_py.sensors.yaml_entry import Entry
-from maplab_py.vimap import MissionSensor, TransformationKind, VIMap, mission_sensor_id
+from maplab_py.vimap import MissionSensor, TransformationKind, VIMap, mission_sensor_id, tables
 from maplab_py.vimap.ids import from_hex, random_ids, to_hex
-from maplab_py.vimap.tables import TransformationEdges
 
 _COVARIANCE = "T_St_Stp1_fixed_covariance"
 """Key of maplab: the covariance (6 x 6), position first, of every edge of the sensor."""
@@ -85,7 +83,7 @@ def attach_wheels(
         covariance = _covariances(T_A_B, options, is_planar=track.is_planar)
     seed = content_words(vi_map, mission, "wheel edges", times_ns, T_O_S)
     count, rng = len(first), np.random.default_rng(seed)
-    edges = TransformationEdges.filled(
+    edges = tables.TransformationEdges.filled(
         count,
         id=random_ids(count, rng),
         kind=np.full(count, int(TransformationKind.WHEEL_ODOMETRY)),
@@ -95,7 +93,7 @@ def attach_wheels(
         covariance=np.broadcast_to(covariance, (count, 6, 6)),
         sensor_id=np.tile(words, (count, 1)),
     )
-    table = TransformationEdges.concatenate([vi_map.transformation_edges, edges])
+    table = tables.TransformationEdges.concatenate([vi_map.transformation_edges, edges])
     result = vi_map.replace(transformation_edges=table)
     return AttachedWheels(result, to_hex(words), count, len(rows) - 1 - count, ratio)
 
@@ -128,7 +126,7 @@ def _with_given_sensor(
     words = from_hex(sensor.id)
     ids = np.array(vi_map.missions.sensor_id)
     ids[mission, MissionSensor.WHEEL_ODOMETRY] = words
-    entry = Entry(sensor.keys, f"sensors.yaml: sensor {sensor.id}")
+    entry = yaml_entry.Entry(sensor.keys, f"sensors.yaml: sensor {sensor.id}")
     covariance = entry.matrix(_COVARIANCE, 6, 6) if _COVARIANCE in entry else None
     return vi_map.replace(missions=vi_map.missions.replace(sensor_id=ids)), words, covariance
 

@@ -5,8 +5,7 @@ from typing import Any
 import numpy as np
 
 from maplab_py.array_types import F64, I64, Mask, NDArray
-from maplab_py.vimap import DescriptorBlock, VIMap
-from maplab_py.vimap.edits import remove_keypoints
+from maplab_py.vimap import DescriptorBlock, VIMap, edits
 from maplab_py.vimap.table import object_column, starts_of_counts
 from maplab_py.vimap.tables import DescriptorLayout, FrameField, Keypoints
 from maplab_py.vision.descriptors import DescriptorKind
@@ -45,7 +44,7 @@ def without_kind(vi_map: VIMap, frames: Mask, kind: DescriptorKind) -> VIMap:
         dropped = [bool(frames[row]) and (_is(block, kind) or not block.size) for block in of_frame]
         removed.append(np.repeat(dropped, [block.keypoints for block in of_frame]))
     none: Mask = np.zeros(0, dtype=np.bool_)
-    return remove_keypoints(vi_map, np.concatenate([none, *removed]))
+    return edits.remove_keypoints(vi_map, np.concatenate([none, *removed]))
 
 
 def with_features(

@@ -13,8 +13,7 @@ from maplab_py.distinct import distinct
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import VIMap, mission_mask, type_name
-from maplab_py.vimap.tables import FrameField
+from maplab_py.vimap import VIMap, mission_mask, tables, type_name
 from maplab_py.vision.descriptors import DescriptorKind
 from maplab_py.vision.epipolar_matching import EpipolarRule, ImageRays, match_images
 from maplab_py.vision.track_union import unite_tracks
@@ -67,7 +66,7 @@ def track_features(
     tracked = np.flatnonzero(track >= 0)
     frames = vi_map.frames
     present = frames.present.copy()
-    present[distinct(vi_map.keypoint_frame[tracked])] |= np.uint16(FrameField.TRACK_ID)
+    present[distinct(vi_map.keypoint_frame[tracked])] |= np.uint16(tables.FrameField.TRACK_ID)
     ids = np.where(track >= 0, track, vi_map.keypoints.track_id)
     result = vi_map.replace(
         frames=frames.replace(present=present), keypoints=vi_map.keypoints.replace(track_id=ids)

@@ -13,8 +13,7 @@ from maplab_py.distinct import distinct
 from maplab_py.geometry.triangulation import largest_ray_angle
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
-from maplab_py.vimap import LandmarkQuality, VIMap, ragged_rows, starts_of_counts, to_hex
-from maplab_py.vimap.queries import landmark_mask
+from maplab_py.vimap import LandmarkQuality, VIMap, queries, ragged_rows, starts_of_counts, to_hex
 
 _USUAL_SIGMA_PX = 1.0
 """Standard deviation of keypoints of which the map has none."""
@@ -53,7 +52,7 @@ def evaluate_quality(
         MapError: A mission's camera rig or IMU is not in sensors.yaml.
     """
     progress.check()
-    rows = np.flatnonzero(landmark_mask(vi_map, missions))
+    rows = np.flatnonzero(queries.landmark_mask(vi_map, missions))
     judged, reasons = _judge(vi_map, rows, options)
     before, after = vi_map.landmarks.quality[rows], judged.landmarks.quality[rows]
     return judged, _report(before, after, reasons)
@@ -78,7 +77,7 @@ def reset_quality(
 ) -> tuple[VIMap, LandmarkQualityReport]:
     """Set the quality of every landmark stored in the missions to unknown."""
     progress.check()
-    rows = np.flatnonzero(landmark_mask(vi_map, missions))
+    rows = np.flatnonzero(queries.landmark_mask(vi_map, missions))
     quality = vi_map.landmarks.quality.copy()
     before = quality[rows]
     quality[rows] = LandmarkQuality.UNKNOWN

@@ -2,19 +2,15 @@
 
 import numpy as np
 
+from maplab_py.algorithms.landmarks import sightings, tracks, triangulation
 from maplab_py.algorithms.landmarks.options import (
     InvalidObservationOptions,
     InvalidObservationReport,
     LandmarkRemovalReport,
 )
-from maplab_py.algorithms.landmarks.sightings import Residuals, is_lidar, residuals
-from maplab_py.algorithms.landmarks.tracks import add_tracks, group_tracks
-from maplab_py.algorithms.landmarks.triangulation import triangulate_keypoints
 from maplab_py.array_types import I64, Mask, NDArray
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import LandmarkQuality, VIMap
-from maplab_py.vimap.edits import remove_landmarks, remove_observations
-from maplab_py.vimap.queries import landmark_mask, observation_counts
+from maplab_py.vimap import LandmarkQuality, VIMap, edits, queries
 
 
 def remove_bad(
@@ -22,13 +18,13 @@ def remove_bad(
 ) -> tuple[VIMap, LandmarkRemovalReport]:
     """Remove every landmark of quality bad that is stored in the missions (None = all)."""
     progress.check()
-    chosen = landmark_mask(vi_map, missions)
+    chosen = queries.landmark_mask(vi_map, missions)
     bad = chosen & (vi_map.landmarks.quality == LandmarkQuality.BAD)
-    result = remove_landmarks(vi_map, bad)
+    result = edits.remove_landmarks(vi_map, bad)
     unknown = vi_map.landmarks.quality == LandmarkQuality.UNKNOWN
     report = LandmarkRemovalReport(
         landmarks_removed=int(bad.sum()),
-        observations_removed=int(observation_counts(vi_map)[bad].sum()),
+        observations_removed=int(queries.observation_counts(vi_map)[bad].sum()),
         landmarks_left=int((chosen & ~bad).sum()),
         unknown_left=int((chosen & unknown).sum()),
     )
@@ -59,21 +55,21 @@ def remove_invalid_observations(
         MapError: A mission's camera rig or IMU is not in sensors.yaml.
     """
     progress.check()
-    chosen = landmark_mask(vi_map, missions)
+    chosen = queries.landmark_mask(vi_map, missions)
     keypoints = vi_map.observations[chosen[vi_map.keypoints.landmark[vi_map.observations]]]
     landmark = vi_map.keypoints.landmark[keypoints]
-    seen = residuals(vi_map, keypoints, vi_map.p_G[landmark])
+    seen = sightings.residuals(vi_map, keypoints, vi_map.p_G[landmark])
     twice, behind, far = _reasons(vi_map, keypoints, seen, options.max_reprojection_error_px)
     removed = twice | behind | far
     progress.check()
-    result = remove_observations(vi_map, keypoints[removed])
+    result = edits.remove_observations(vi_map, keypoints[removed])
     added, reattached = 0, 0
     if options.make_new_landmarks:
         result, added, reattached = _from_detached(
             result, keypoints[removed], landmark[removed].astype(np.int64), options
         )
     had = np.diff(vi_map.observation_start) > 0
-    lost = had & (observation_counts(result)[: len(had)] == 0)
+    lost = had & (queries.observation_counts(result)[: len(had)] == 0)
     report = InvalidObservationReport(
         observations=len(keypoints),
         twice_in_frame=int(twice.sum()),
@@ -87,7 +83,7 @@ def remove_invalid_observations(
 
 
 def _reasons(
-    vi_map: VIMap, keypoints: I64, seen: Residuals, max_error_px: float
+    vi_map: VIMap, keypoints: I64, seen: sightings.Residuals, max_error_px: float
 ) -> tuple[Mask, Mask, Mask]:
     """Return which observations (O,) are repeated in a frame, behind the camera, or outliers."""
     landmark, frame = vi_map.keypoints.landmark[keypoints], vi_map.keypoint_frame[keypoints]
@@ -98,7 +94,7 @@ def _reasons(
     )
     twice = np.zeros(len(keypoints), dtype=np.bool_)
     twice[order] = again
-    visual = ~is_lidar(vi_map, landmark)
+    visual = ~sightings.is_lidar(vi_map, landmark)
     behind = visual & (seen.signed_distance_m <= 0.0)
     return twice, behind, visual & (seen.error_px > max_error_px)
 
@@ -108,13 +104,13 @@ def _from_detached(
 ) -> tuple[VIMap, int, int]:
     """Make landmarks from detached keypoints (N,) of one former landmark (N,) and track."""
     tracked = vi_map.keypoints.track_id[keypoints] >= 0
-    rows, start = group_tracks(vi_map, keypoints[tracked], landmark[tracked])
+    rows, start = tracks.group_tracks(vi_map, keypoints[tracked], landmark[tracked])
     if len(start) == 1:
         return vi_map, 0, 0
-    p_G, _, usable = triangulate_keypoints(vi_map, rows, start)
+    p_G, _, usable = triangulation.triangulate_keypoints(vi_map, rows, start)
     group = np.repeat(np.arange(len(start) - 1), np.diff(start))
-    error = residuals(vi_map, rows, p_G[group]).error_px
+    error = sightings.residuals(vi_map, rows, p_G[group]).error_px
     worst = np.maximum.reduceat(error, start[:-1])
     usable &= worst <= options.max_reprojection_error_px
-    result, observations = add_tracks(vi_map, rows, start, p_G, usable)
+    result, observations = tracks.add_tracks(vi_map, rows, start, p_G, usable)
     return result, int(usable.sum()), observations

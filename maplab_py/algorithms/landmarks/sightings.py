@@ -7,8 +7,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64, Mask, NDArray
 from maplab_py.geometry import se3, so3
-from maplab_py.sensors import Camera, Projection
-from maplab_py.sensors.projection import back_project, project
+from maplab_py.sensors import Camera, Projection, projection
 from maplab_py.vimap import MissionSensor, VIMap, mission_sensor_id
 
 LIDAR_FEATURE_TYPES = (21,)
@@ -77,7 +76,7 @@ def rays_in_G(vi_map: VIMap, keypoints: I64) -> tuple[F64, F64, Mask]:
     valid = np.zeros(len(keypoints), dtype=np.bool_)
     for camera, T_I_C, rows in cameras_of(vi_map, keypoints):
         T_G_C = se3.compose(_T_G_I(vi_map, keypoints[rows], camera), T_I_C)
-        bearing, ok = back_project(camera, vi_map.keypoints.uv_px[keypoints[rows]])
+        bearing, ok = projection.back_project(camera, vi_map.keypoints.uv_px[keypoints[rows]])
         origins[rows] = T_G_C[:, 4:]
         directions[rows] = so3.rotate(T_G_C[:, :4], bearing)
         valid[rows] = ok
@@ -96,7 +95,7 @@ def residuals(vi_map: VIMap, keypoints: I64, p_G: F64) -> Residuals:
         camera_keypoints = keypoints[rows]
         T_G_C = se3.compose(_T_G_I(vi_map, camera_keypoints, camera), T_I_C)
         p_C = se3.transform(se3.inverse(T_G_C), p_G[rows])
-        uv, visible = project(camera, p_C)
+        uv, visible = projection.project(camera, p_C)
         error = np.linalg.norm(uv - table.uv_px[camera_keypoints], axis=1)
         error_px[rows] = np.where(visible, error, np.inf)
         in_front = p_C[:, 2] > 0.0 if camera.projection is Projection.PINHOLE else visible

@@ -7,9 +7,8 @@ from maplab_py.algorithms.landmarks.triangulation import retriangulate, triangul
 from maplab_py.array_types import F64, I64, Mask, NDArray
 from maplab_py.geometry import se3
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import VIMap, mission_mask, ragged_rows, starts_of_counts
+from maplab_py.vimap import VIMap, edits, mission_mask, ragged_rows, starts_of_counts
 from maplab_py.vimap.descriptors import NO_DESCRIPTOR, FeatureType
-from maplab_py.vimap.edits import add_landmarks
 
 
 def init_tracks(
@@ -97,7 +96,7 @@ def add_tracks(
     p_I = se3.transform(se3.inverse(vi_map.T_G_I[store]), p_G[groups])
     number = np.repeat(np.arange(len(groups)), np.diff(start)[groups])
     kind = vi_map.feature_type[keypoints[start[:-1][groups]]]
-    added = add_landmarks(
+    added = edits.add_landmarks(
         vi_map,
         vertex=store,
         p_I=p_I,

@@ -8,9 +8,7 @@ from maplab_py.algorithms.landmarks.sightings import is_lidar, rays_in_G, residu
 from maplab_py.array_types import F64, I64, Mask, NDArray
 from maplab_py.geometry import triangulation
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import VIMap, ragged_rows, starts_of_counts
-from maplab_py.vimap.edits import with_p_G
-from maplab_py.vimap.queries import landmark_mask
+from maplab_py.vimap import VIMap, edits, queries, ragged_rows, starts_of_counts
 
 
 def retriangulate(
@@ -36,7 +34,7 @@ def retriangulate(
         MapError: A mission's camera rig or IMU is not in sensors.yaml.
     """
     progress.step(0, 2, "triangulate landmarks")
-    chosen = np.flatnonzero(landmark_mask(vi_map, missions))
+    chosen = np.flatnonzero(queries.landmark_mask(vi_map, missions))
     rows = chosen[~is_lidar(vi_map, chosen)]
     keypoints = vi_map.observations[ragged_rows(vi_map.observation_start, rows)]
     start = starts_of_counts(np.diff(vi_map.observation_start)[rows])
@@ -46,7 +44,7 @@ def retriangulate(
     with np.errstate(over="ignore"):  # from beyond 1e154 m
         shift = np.linalg.norm(p_G[placed] - vi_map.p_G[rows[placed]], axis=1)
     progress.step(1, 2, "judge landmarks")
-    moved = with_p_G(vi_map, rows[placed], p_G[placed])
+    moved = edits.with_p_G(vi_map, rows[placed], p_G[placed])
     judged, quality = evaluate_quality(moved, options, missions=missions, progress=progress)
     report = RetriangulationReport(
         landmarks=len(chosen),

@@ -11,8 +11,7 @@ from maplab_py.array_types import F64, I64, U64, NDArray
 from maplab_py.distinct import distinct
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.storage.summary_map import SummaryMap
-from maplab_py.vimap import FeatureType, LandmarkQuality, VIMap, type_name
-from maplab_py.vimap.table import ragged_rows, starts_of_counts
+from maplab_py.vimap import FeatureType, LandmarkQuality, VIMap, table, type_name
 from maplab_py.vision.descriptors import DescriptorKind
 from maplab_py.vision.index import DescriptorSet
 from maplab_py.vision.projection import DescriptorProjection
@@ -62,7 +61,7 @@ class LocalizationMap:
         """Offsets (L + 1) and observation rows, by landmark."""
         label = self.descriptors.label
         counts = np.bincount(label, minlength=len(self.p_G))
-        return starts_of_counts(counts), np.argsort(label, kind="stable")
+        return table.starts_of_counts(counts), np.argsort(label, kind="stable")
 
     @cached_property
     def sights(self) -> Sights:
@@ -92,7 +91,7 @@ class LocalizationMap:
         start, landmarks = self.landmarks_of
         mine = landmarks[start[observer] : start[observer + 1]]
         offset, observers = self.observers_of
-        seen = observers[ragged_rows(offset, mine)]
+        seen = observers[table.ragged_rows(offset, mine)]
         near = np.bincount(seen, minlength=len(self.p_G_observer)) >= min_shared
         near[observer] = True
         return np.asarray(near)
@@ -204,4 +203,4 @@ def _group(key: I64, value: I64, groups: int) -> tuple[I64, I64]:
     size = int(value.max(initial=0)) + 1
     pairs = distinct(key * size + value)
     counts = np.bincount(pairs // size, minlength=groups)
-    return starts_of_counts(counts), pairs % size
+    return table.starts_of_counts(counts), pairs % size

@@ -16,8 +16,7 @@ from maplab_py.geometry import se3, so3
 from maplab_py.geometry.alignment import align_yaw_position, umeyama
 from maplab_py.geometry.interpolation import interpolate_poses
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import VIMap, starts_of_counts, to_hex_list
-from maplab_py.vimap.descriptors import sizes_of_type
+from maplab_py.vimap import VIMap, descriptors, starts_of_counts, to_hex_list
 from maplab_py.vision.projection import DescriptorProjection
 
 _ROUNDS = 15
@@ -193,7 +192,7 @@ def query_vertices(vi_map: VIMap, missions: I64, projection: DescriptorProjectio
         EstimationError: The map has no descriptors, or others than the projection takes.
     """
     kind = projection.kind
-    has_kind = sizes_of_type(vi_map.frames, kind.feature_type, kind.depth) == kind.size
+    has_kind = descriptors.sizes_of_type(vi_map.frames, kind.feature_type, kind.depth) == kind.size
     features, _ = map_features(
         vi_map,
         missions,

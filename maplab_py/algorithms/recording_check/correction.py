@@ -5,10 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from maplab_py.algorithms.recording_check.doctor import Diagnosis
+from maplab_py.algorithms.recording_check import doctor, inertial_checks, turn_checks
 from maplab_py.algorithms.recording_check.findings import Finding, Verdict
-from maplab_py.algorithms.recording_check.inertial_checks import measured_quiet
-from maplab_py.algorithms.recording_check.turn_checks import check_clock, check_scale
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.device import RecordedSensors
 from maplab_py.sensors import CameraRig, Imu
@@ -26,7 +24,7 @@ class Correction:
     notes: tuple[str, ...]
 
 
-def correct(diagnosis: Diagnosis) -> Correction:
+def correct(diagnosis: doctor.Diagnosis) -> Correction:
     """Return the calibration of a recording with what its diagnosis shows to be off.
 
     Units and axes are of the samples, not of the calibration: they are only told.
@@ -48,15 +46,15 @@ def correct(diagnosis: Diagnosis) -> Correction:
     return Correction(device, tuple(notes) or ("nothing to correct",))
 
 
-def _verdicts(diagnosis: Diagnosis, beginning: str) -> list[Finding]:
+def _verdicts(diagnosis: doctor.Diagnosis, beginning: str) -> list[Finding]:
     return [f for f in diagnosis.findings if f.check.startswith(beginning) and f.verdict in _MENDED]
 
 
-def _corrected_rig(diagnosis: Diagnosis) -> tuple[CameraRig, list[str]]:
+def _corrected_rig(diagnosis: doctor.Diagnosis) -> tuple[CameraRig, list[str]]:
     device, notes = diagnosis.signals.device, []
     rig, T_B_C = device.rig, device.rig.T_B_C.copy()
     models = list(rig.cameras)
-    is_late = check_clock(diagnosis.cameras, rig.cameras).verdict in _MENDED
+    is_late = turn_checks.check_clock(diagnosis.cameras, rig.cameras).verdict in _MENDED
     for row, camera in enumerate(diagnosis.cameras):
         fit = camera.hand_eye
         if fit is None or not camera.agrees:
@@ -84,9 +82,9 @@ def _corrected_rig(diagnosis: Diagnosis) -> tuple[CameraRig, list[str]]:
     return dataclasses.replace(rig, cameras=tuple(models), T_B_C=T_B_C), notes
 
 
-def _corrected_imu(diagnosis: Diagnosis, imu: Imu) -> tuple[Imu, list[str]]:
+def _corrected_imu(diagnosis: doctor.Diagnosis, imu: Imu) -> tuple[Imu, list[str]]:
     notes: list[str] = []
-    quiet = measured_quiet(diagnosis.signals)
+    quiet = inertial_checks.measured_quiet(diagnosis.signals)
     if quiet is not None:
         units = {"acc": 1.0, "gyro": diagnosis.cameras[0].unit}
         for name, key, measured in (
@@ -99,7 +97,7 @@ def _corrected_imu(diagnosis: Diagnosis, imu: Imu) -> tuple[Imu, list[str]]:
                 imu = dataclasses.replace(imu, **changed)
                 notes.append(f"{key}_noise_density {density:.3g}")
     fit = diagnosis.cameras[0].hand_eye
-    if fit is not None and check_scale(diagnosis.cameras).verdict in _MENDED:
+    if fit is not None and turn_checks.check_scale(diagnosis.cameras).verdict in _MENDED:
         known = imu.intrinsics or ImuIntrinsics()
         scaled = dataclasses.replace(known, T_g=fit.scale * known.T_g)
         imu = dataclasses.replace(imu, intrinsics=scaled)

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from maplab_py.algorithms.recording_check import inertial_checks, turn_checks
+from maplab_py.algorithms.recording_check import image_checks, inertial_checks, stereo, turn_checks
 from maplab_py.algorithms.recording_check.findings import (
     Finding,
     RecordingCheck,
@@ -14,17 +14,14 @@ from maplab_py.algorithms.recording_check.findings import (
     ok,
     unknown,
 )
-from maplab_py.algorithms.recording_check.image_checks import check_images
 from maplab_py.algorithms.recording_check.rates import CameraTurns, analyse_camera
 from maplab_py.algorithms.recording_check.signals import Signals, read_signals
-from maplab_py.algorithms.recording_check.stereo import StereoFit, fit_stereo
 from maplab_py.algorithms.recording_check.timing_checks import cannot_work, check_times
 from maplab_py.array_types import F64
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
-from maplab_py.interop.recordings.map_replay import MapRecording
+from maplab_py.interop.recordings import map_replay, protocol
 from maplab_py.interop.recordings.options import StreamOptions
-from maplab_py.interop.recordings.protocol import Recording
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap
 
@@ -43,7 +40,7 @@ class Diagnosis:
 
 
 def diagnose(
-    recording: Recording,
+    recording: protocol.Recording,
     stream: StreamOptions | None = None,
     *,
     first_s: float = 0.0,
@@ -75,12 +72,12 @@ def diagnose_signals(
     if cannot_work(signals, is_whole=is_whole):
         return Diagnosis(signals, tuple(findings), ())
     cameras = tuple(analyse_camera(signals, row) for row in range(len(signals.cameras)))
-    findings += check_images(signals)
+    findings += image_checks.check_images(signals)
     findings += [*_check_motion(signals, cameras), *_check_noise(signals, cameras)]
     return Diagnosis(signals, tuple(findings), cameras)
 
 
-def report(diagnosis: Diagnosis, recording: Recording) -> RecordingCheck:
+def report(diagnosis: Diagnosis, recording: protocol.Recording) -> RecordingCheck:
     """Return the report on a diagnosis."""
     signals = diagnosis.signals
     return RecordingCheck(
@@ -99,7 +96,7 @@ def first_cause(diagnosis: Diagnosis) -> Finding | None:
     return first if is_grave else None
 
 
-def check_first_seconds(recording: Recording, stream: StreamOptions) -> tuple[str, ...]:
+def check_first_seconds(recording: protocol.Recording, stream: StreamOptions) -> tuple[str, ...]:
     """Return a line on what the first seconds show to be wrong, none if all is well.
 
     Raises:
@@ -138,7 +135,7 @@ def map_findings(vi_map: VIMap) -> tuple[Finding, ...]:
         return ()
     counts = np.bincount(vi_map.vertices.mission, minlength=len(vi_map.missions))
     try:
-        recording = MapRecording(vi_map, int(np.argmax(counts)))
+        recording = map_replay.MapRecording(vi_map, int(np.argmax(counts)))
         signals = read_signals(recording)
     except MapError:
         return ()
@@ -183,10 +180,10 @@ def _check_noise(signals: Signals, cameras: Sequence[CameraTurns]) -> Iterator[F
         yield from inertial_checks.check_noise(signals.device.imu, quiet, units)
 
 
-def _stereo_fits(signals: Signals) -> list[StereoFit | None]:
+def _stereo_fits(signals: Signals) -> list[stereo.StereoFit | None]:
     cameras, T_I_C = signals.device.cameras, signals.device.T_I_C
     return [
-        fit_stereo(points, (cameras[0], cameras[row]), _pose_between(T_I_C, row))
+        stereo.fit_stereo(points, (cameras[0], cameras[row]), _pose_between(T_I_C, row))
         for row, points in enumerate(signals.stereo, start=1)
     ]
 
@@ -196,7 +193,7 @@ def _pose_between(T_I_C: F64, row: int) -> F64:
 
 
 def _check_stereo(
-    cameras: Sequence[CameraTurns], fits: Sequence[StereoFit | None]
+    cameras: Sequence[CameraTurns], fits: Sequence[stereo.StereoFit | None]
 ) -> Iterator[Finding]:
     """Yield a finding on the first and each other camera that see the same."""
     for row, fit in enumerate(fits, start=1):

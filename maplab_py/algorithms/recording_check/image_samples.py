@@ -9,8 +9,7 @@ import numpy as np
 from maplab_py.array_types import F64, I64, U8, Mask
 from maplab_py.interop.recordings.protocol import TrackedFrame
 from maplab_py.sensors import Camera
-from maplab_py.vision.features.detection import GridDetector, refined
-from maplab_py.vision.features.images import ImagePreparation
+from maplab_py.vision.features import detection, images
 from maplab_py.vision.features.options import FeatureOptions
 from maplab_py.vision.tracking.flow import FlowOptions, follow
 
@@ -76,8 +75,8 @@ class CameraSampler:
         while camera.width_px * factor > _WIDEST_PX:
             factor *= 0.5
         options = FeatureOptions(detector_max_feature_count=MOST_POINTS, image_resize_factor=factor)
-        self._preparation = ImagePreparation.of(camera, row, options)
-        self._detector = GridDetector(options, self._preparation.usable)
+        self._preparation = images.ImagePreparation.of(camera, row, options)
+        self._detector = detection.GridDetector(options, self._preparation.usable)
         self.figures: list[ImageFigures] = []
         self.pairs: list[tuple[int, int, F64]] = []
         self._last: tuple[int, U8, F64] | None = None
@@ -91,7 +90,7 @@ class CameraSampler:
     def add(self, time_ns: int, grey: U8) -> None:
         """Take an image (H, W) of 8 bits."""
         image, before = self._preparation.prepare(grey), self._last
-        uv = refined(image, self._detector.detect(image, np.zeros((0, 2))))
+        uv = detection.refined(image, self._detector.detect(image, np.zeros((0, 2))))
         is_repeated = before is not None and np.array_equal(before[1], image)
         self.figures.append(_figures(time_ns, image, len(uv), is_repeated))
         if before is not None and time_ns - before[0] <= _LONGEST_S * 1e9:

@@ -4,16 +4,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from maplab_py.algorithms.recording_check import inertial, rates, turns
 from maplab_py.algorithms.recording_check.findings import Finding, Verdict, ok, unknown
-from maplab_py.algorithms.recording_check.inertial import (
-    QuietImu,
-    fit_accel_axes,
-    fit_accel_sign,
-    quiet_figures,
-)
-from maplab_py.algorithms.recording_check.rates import CameraTurns
 from maplab_py.algorithms.recording_check.signals import Signals
-from maplab_py.algorithms.recording_check.turns import GyroTurns
 from maplab_py.array_types import F64
 from maplab_py.sensors import Imu
 
@@ -36,14 +29,14 @@ _FASTEST_RADPS = 12.0
 _SIGN_SCORE = 0.6
 
 
-def accel_unit(quiet: QuietImu) -> float:
+def accel_unit(quiet: inertial.QuietImu) -> float:
     """Return the m/s^2 that the unit of the accelerometer is."""
     size = max(quiet.accel_norm, 1e-9)
     unit = min(_ACCEL_UNITS, key=lambda known: abs(np.log(size * known / GRAVITY)))
     return unit if abs(size * unit / GRAVITY - 1.0) < _UNIT_TOLERANCE else 1.0
 
 
-def check_magnitude(signals: Signals, quiet: QuietImu | None) -> Iterator[Finding]:
+def check_magnitude(signals: Signals, quiet: inertial.QuietImu | None) -> Iterator[Finding]:
     """Yield findings on the unit of the accelerometer, on missing values, and on saturation."""
     values = signals.imu.accel_gyro
     for name, part, unit in (
@@ -101,14 +94,14 @@ def check_gyro_alone(signals: Signals) -> Finding | None:
 
 
 def check_accel_axes(
-    signals: Signals, accel: F64, camera: CameraTurns | None
+    signals: Signals, accel: F64, camera: rates.CameraTurns | None
 ) -> tuple[Finding, bool]:
     """Return a finding on the axes of the accelerometer, and whether they are those of the gyroscope."""
     check = "axes of the accelerometer"
     expected = "gravity stays where it is while the gyroscope turns"
     if camera is None or camera.gyro is None:
         return unknown(check, "no images to know the gyroscope's bias from", expected), False
-    fit = fit_accel_axes(signals.imu.times_ns, accel, camera.gyro.shifted(-camera.bias))
+    fit = inertial.fit_accel_axes(signals.imu.times_ns, accel, camera.gyro.shifted(-camera.bias))
     if fit is None:
         return unknown(check, "the recording is too short", expected), False
     observed = f"its direction spreads by {np.degrees(fit.as_is):.1f} deg"
@@ -119,7 +112,7 @@ def check_accel_axes(
     return ok(check, observed, expected), True
 
 
-def raw_axes_agree(signals: Signals, accel: F64, camera: CameraTurns) -> bool | None:
+def raw_axes_agree(signals: Signals, accel: F64, camera: rates.CameraTurns) -> bool | None:
     """Tell whether the accelerometer agrees with the gyroscope's axes as recorded better than as exchanged.
 
     Returns:
@@ -129,8 +122,8 @@ def raw_axes_agree(signals: Signals, accel: F64, camera: CameraTurns) -> bool | 
         return None
     as_exchanged = camera.gyro.shifted(-camera.bias)
     times_ns, back = signals.imu.times_ns, np.linalg.inv(camera.axes)
-    as_recorded = GyroTurns(times_ns, as_exchanged.rate_at(times_ns) @ back.T)
-    fits = [fit_accel_axes(times_ns, accel, g) for g in (as_recorded, as_exchanged)]
+    as_recorded = turns.GyroTurns(times_ns, as_exchanged.rate_at(times_ns) @ back.T)
+    fits = [inertial.fit_accel_axes(times_ns, accel, g) for g in (as_recorded, as_exchanged)]
     if fits[0] is None or fits[1] is None:
         return None
     spread, exchanged = fits[0].as_is, fits[1].as_is
@@ -139,7 +132,7 @@ def raw_axes_agree(signals: Signals, accel: F64, camera: CameraTurns) -> bool | 
     return spread < exchanged
 
 
-def check_accel_sign(signals: Signals, accel: F64, camera: CameraTurns | None) -> Finding:
+def check_accel_sign(signals: Signals, accel: F64, camera: rates.CameraTurns | None) -> Finding:
     """Return a finding on the sign of the accelerometer."""
     check, expected = "sign of the accelerometer", "+g upwards at rest"
     if camera is None or camera.gyro is None or camera.hand_eye is None:
@@ -147,7 +140,7 @@ def check_accel_sign(signals: Signals, accel: F64, camera: CameraTurns | None) -
     pose = camera.hand_eye.R_I_C, signals.device.T_I_C[0, 4:]
     gyro = camera.gyro.shifted(-camera.bias)
     rays = camera.rays.later(camera.hand_eye.delay_s)
-    fit = fit_accel_sign(camera.turns, rays, gyro, accel, signals.imu.times_ns, pose)
+    fit = inertial.fit_accel_sign(camera.turns, rays, gyro, accel, signals.imu.times_ns, pose)
     if fit is None or abs(fit.score) < max(_SIGN_SCORE, 4.0 * fit.sigma):
         return unknown(check, "too little acceleration to tell", expected)
     if fit.score > 0.0:
@@ -161,7 +154,9 @@ def check_accel_sign(signals: Signals, accel: F64, camera: CameraTurns | None) -
     )
 
 
-def check_noise(imu: Imu, quiet: QuietImu | None, units: tuple[float, float]) -> Iterator[Finding]:
+def check_noise(
+    imu: Imu, quiet: inertial.QuietImu | None, units: tuple[float, float]
+) -> Iterator[Finding]:
     """Yield findings on the noise densities; a device that never rests shows only upper bounds of them."""
     if quiet is None:
         return
@@ -188,11 +183,11 @@ def check_noise(imu: Imu, quiet: QuietImu | None, units: tuple[float, float]) ->
             yield ok(check, observed, expected)
 
 
-def measured_quiet(signals: Signals) -> QuietImu | None:
+def measured_quiet(signals: Signals) -> inertial.QuietImu | None:
     """Return the figures of the quietest seconds of the recording."""
     if len(signals.imu) < 10:
         return None
-    return quiet_figures(signals.imu.times_ns, signals.imu.accel_gyro)
+    return inertial.quiet_figures(signals.imu.times_ns, signals.imu.accel_gyro)
 
 
 def axes_text(axes: F64) -> str:

@@ -16,8 +16,7 @@ from maplab_py.algorithms.recording_check.image_samples import (
 from maplab_py.algorithms.recording_check.stereo import StereoSampler
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import MapError
-from maplab_py.interop.recordings import protocol
-from maplab_py.interop.recordings.clocks import ClockRestart
+from maplab_py.interop.recordings import clocks, protocol
 from maplab_py.interop.recordings.options import StreamOptions
 from maplab_py.interop.recordings.stream import Synchroniser
 from maplab_py.progress import SILENT, Progress
@@ -108,7 +107,7 @@ def read_signals(
     try:
         items = recording.items(start_ns if stream.start_s else None, end_ns)
         reader.read(items, first_s, progress)
-    except ClockRestart as error:
+    except clocks.ClockRestart as error:
         restart = str(error)
     return reader.signals(restart)
 

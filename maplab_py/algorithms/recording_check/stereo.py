@@ -7,8 +7,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, U8
 from maplab_py.geometry import se3, so3
-from maplab_py.sensors import Camera
-from maplab_py.sensors.projection import back_project
+from maplab_py.sensors import Camera, projection
 from maplab_py.vision.tracking.flow import FlowOptions, follow
 
 _MOST_SETS = 60
@@ -114,7 +113,7 @@ def fit_stereo(points: F64, cameras: tuple[Camera, Camera], T_1_2: F64) -> Stere
 
 
 def _rays(points: F64, cameras: tuple[Camera, ...]) -> tuple[F64, Any]:
-    parts = [back_project(camera, points[:, i]) for i, camera in enumerate(cameras)]
+    parts = [projection.back_project(camera, points[:, i]) for i, camera in enumerate(cameras)]
     ray = np.stack([np.nan_to_num(part[0]) for part in parts], axis=1)
     length = np.maximum(np.linalg.norm(ray, axis=2, keepdims=True), 1e-12)
     return ray / length, parts[0][1] & parts[1][1]

@@ -34,8 +34,7 @@ from maplab_py.estimation.problem.gauge import clusters
 from maplab_py.estimation.terms.pose_graph import TiltPriors
 from maplab_py.geometry import se3, so3
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import IdIndex, LoopClosureEdges, VIMap, to_hex
-from maplab_py.vimap.descriptors import type_name, types_of
+from maplab_py.vimap import IdIndex, LoopClosureEdges, VIMap, descriptors, to_hex
 
 _NUM_WORST = 10
 
@@ -254,9 +253,9 @@ def relax_over_loops(
         EstimationError: Nothing to recognise places by, or the pose graph has no usable solution.
     """
     wanted = loop_options.type_number
-    if wanted not in types_of(vi_map.frames) and len(vi_map.loop_closure_edges):
+    if wanted not in descriptors.types_of(vi_map.frames) and len(vi_map.loop_closure_edges):
         relaxed = relax_graph(vi_map, options, missions=missions, progress=progress)
-        name = type_name(wanted)
+        name = descriptors.type_name(wanted)
         note = f"the map has no {name} descriptors: only its own loop closure edges count"
         return relaxed.vi_map, LoopClosureReport(notes=(note,)), relaxed.report
     search, search_report = search_loops(vi_map, loop_options, missions=missions, progress=progress)

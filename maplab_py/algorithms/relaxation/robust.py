@@ -13,9 +13,8 @@ from maplab_py.array_types import F64, Mask
 from maplab_py.estimation.kernels.loss import loss_and_weight
 from maplab_py.estimation.linear.threads import single_blas_thread
 from maplab_py.estimation.loss import Loss
-from maplab_py.estimation.problem.pose_graph import PoseGraphProblem
+from maplab_py.estimation.problem import pose_graph, trust_region
 from maplab_py.estimation.problem.solver import SLOW_CONVERGENCE, SolverOptions, optimize_states
-from maplab_py.estimation.problem.trust_region import Schedule
 from maplab_py.estimation.terms.pose_graph import RelativePoses, TiltPriors
 from maplab_py.geometry import symmetric
 from maplab_py.progress import Progress
@@ -89,7 +88,7 @@ def optimize_robustly(
         EstimationError: The poses are not determined, or not finite.
     """
     loss = _LOSSES[options.robustness]
-    problem = PoseGraphProblem(is_free, trajectory, loops, tilt, loss)
+    problem = pose_graph.PoseGraphProblem(is_free, trajectory, loops, tilt, loss)
     graph = _Graph(T_G_I, problem, loops, loss, options, progress)
     if options.robustness == "gnc":
         return graph.consistent()
@@ -103,7 +102,7 @@ class _Graph:
     """Data that all ways of optimising a graph need."""
 
     T_G_I: F64
-    problem: PoseGraphProblem
+    problem: pose_graph.PoseGraphProblem
     loops: RelativePoses
     loss: Loss
     options: RelaxationOptions
@@ -211,7 +210,7 @@ class _Graph:
         return Solution(T, kept.astype(np.float64), iterations + used, first, last), limit
 
     def _measure(
-        self, problem: PoseGraphProblem, T: F64, kept: Mask
+        self, problem: pose_graph.PoseGraphProblem, T: F64, kept: Mask
     ) -> tuple[F64, int, F64, float]:
         """Optimise with some closures; return poses, iterations, independent errors, their limit."""
         problem.set_active(kept)
@@ -235,12 +234,12 @@ class _Graph:
         self.problem.set_squared_scale(penalty)
         return self._solve(self.problem, T, _STAGE_ITERATIONS, _STAGE_TOLERANCE)
 
-    def _finish(self, problem: PoseGraphProblem, T: F64) -> tuple[F64, int]:
+    def _finish(self, problem: pose_graph.PoseGraphProblem, T: F64) -> tuple[F64, int]:
         options = self.options
         return self._solve(problem, T, options.num_iterations, options.function_tolerance)
 
     def _solve(
-        self, problem: PoseGraphProblem, T: F64, num_iterations: int, tolerance: float
+        self, problem: pose_graph.PoseGraphProblem, T: F64, num_iterations: int, tolerance: float
     ) -> tuple[F64, int]:
         """Return poses and accepted steps.
 
@@ -263,7 +262,7 @@ class _Graph:
             options,
             num_iterations=num_iterations - summary.iterations,
             initial_radius=_NEWTON_RADIUS,
-            schedule=Schedule.CERES,
+            schedule=trust_region.Schedule.CERES,
             slow_ratio=1.0,
         )
         T, newton = optimize_states(problem, T, rest, self.progress)

@@ -31,9 +31,7 @@ from maplab_py.distinct import distinct
 from maplab_py.errors import UserError
 from maplab_py.memory import require_memory
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import LandmarkQuality, VIMap, observer_counts, to_hex
-from maplab_py.vimap.edits import remove_landmarks
-from maplab_py.vimap.table import ragged_rows, starts_of_counts
+from maplab_py.vimap import LandmarkQuality, VIMap, edits, observer_counts, table, to_hex
 
 _BYTES_PER_OBSERVATION = 400
 _WORST = 10
@@ -94,7 +92,7 @@ def sparsify(
         solution, parts = choose(problem, options, progress)
     kept = np.zeros(len(judged.landmarks), dtype=np.bool_)
     kept[good[solution.chosen]] = True
-    result = remove_landmarks(judged, ~kept)
+    result = edits.remove_landmarks(judged, ~kept)
     coverage = _coverage(problem, vertex, solution.chosen, options)
     report = SparsificationReport(
         landmarks_before=len(vi_map.landmarks),
@@ -335,7 +333,7 @@ def descriptor_deviations(vi_map: VIMap, landmarks: I64) -> F64:
         return deviation
     observations = vi_map.observations[sizes[vi_map.observations] > 0]
     observed = vi_map.keypoints.landmark[observations]
-    start = starts_of_counts(np.bincount(observed, minlength=len(vi_map.landmarks)))
+    start = table.starts_of_counts(np.bincount(observed, minlength=len(vi_map.landmarks)))
     count = np.diff(start)[landmarks]
     chunk = np.cumsum(count) // _OBSERVATIONS_AT_ONCE
     starts = np.flatnonzero(np.diff(chunk, prepend=-1))
@@ -344,7 +342,7 @@ def descriptor_deviations(vi_map: VIMap, landmarks: I64) -> F64:
         mine = mine[count[mine] >= 2]
         if len(mine) == 0:
             continue
-        rows = observations[ragged_rows(start, landmarks[mine])]
+        rows = observations[table.ragged_rows(start, landmarks[mine])]
         bits = np.unpackbits(vi_map.keypoints.descriptor[rows, :size], axis=1)
         first = np.cumsum(count[mine]) - count[mine]
         ones = np.add.reduceat(bits, first, axis=0, dtype=np.int32)

@@ -12,8 +12,7 @@ from maplab_py.algorithms.keyframing.options import KeyframingOptions
 from maplab_py.geometry.triangulation import largest_ray_angle
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
-from maplab_py.vimap import LandmarkQuality, VIMap, observation_counts, observer_counts
-from maplab_py.vimap.edits import remove_landmarks
+from maplab_py.vimap import LandmarkQuality, VIMap, edits, observation_counts, observer_counts
 from maplab_py.vision.projection import DIMENSIONS
 
 
@@ -226,7 +225,7 @@ def _savings(
     bad = vi_map.landmarks.quality == LandmarkQuality.BAD
     tried(
         "remove_bad_landmarks",
-        remove_landmarks(vi_map, bad),
+        edits.remove_landmarks(vi_map, bad),
         f"{int(bad.sum())} landmarks are removed",
     )
     progress.step(1, 3, "sparsification")
@@ -239,7 +238,7 @@ def _savings(
         what = f"{keep} landmarks, a tenth of the good ones, stay; their keypoints stay in any case"
         tried(
             f"landmark_sparsify --num_landmarks_to_keep={keep}",
-            remove_landmarks(vi_map, removed),
+            edits.remove_landmarks(vi_map, removed),
             what,
         )
     progress.step(2, 3, "summary map")

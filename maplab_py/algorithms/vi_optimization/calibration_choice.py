@@ -15,8 +15,7 @@ from maplab_py.algorithms.vi_optimization.map_problem import MapProblem, build, 
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.algorithms.vi_optimization.reports import CalibratedParameter, VIOptimizationReport
 from maplab_py.array_types import F64, I64, NDArray
-from maplab_py.estimation.linear.protocol import NotPositiveDefinite
-from maplab_py.estimation.linear.threads import single_blas_thread
+from maplab_py.estimation.linear import protocol, threads
 from maplab_py.estimation.terms.cameras import EXTRINSICS, INTRINSICS, TIMING
 from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors.camera import MIRROR_NAMES
@@ -153,12 +152,12 @@ def _newton_step(map_problem: MapProblem) -> _Step | None:
                 free_numbers.append((of_block[row, column // 3], column % 3, number, unit))
     table = np.array(free_numbers, dtype=np.float64).reshape(-1, 4)
     node, direction, numbers = table[:, :3].astype(np.int64).T
-    with single_blas_thread():
+    with threads.single_blas_thread():
         problem.relinearize(states)
         linear = problem.linearize(states, _LANDMARK_DAMPING)
         try:
             step = problem.solve(linear, 0.0)
-        except NotPositiveDefinite:
+        except protocol.NotPositiveDefinite:
             return None
         covariance = problem.covariance_columns(node, direction)[node, direction]
     # in standard deviations, so that numbers of all sizes can be inverted together

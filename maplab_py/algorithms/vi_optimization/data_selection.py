@@ -11,13 +11,10 @@ from maplab_py.distinct import distinct
 from maplab_py.errors import MapError, UserError
 from maplab_py.estimation.states import States
 from maplab_py.estimation.terms.visual import Observations
-from maplab_py.geometry import so3
-from maplab_py.geometry.triangulation import triangulate
+from maplab_py.geometry import so3, triangulation
 from maplab_py.memory import require_memory
 from maplab_py.report import counted
-from maplab_py.vimap import LandmarkQuality, VIMap, to_hex, type_name, type_of_name
-from maplab_py.vimap.queries import is_metric
-from maplab_py.vimap.table import ragged_rows, starts_of_counts
+from maplab_py.vimap import LandmarkQuality, VIMap, queries, table, to_hex, type_name, type_of_name
 
 _PRIOR_SIGMA_M = 10.0
 """Standard deviation of a landmark before its first observation."""
@@ -101,7 +98,7 @@ def _links(vi_map: VIMap, vertex: I64, landmark: I64, limit: int) -> tuple[I64, 
     match_vertices(a, b, limit, np.zeros(len(vi_map.vertices), dtype=np.int64), kept)
     ends = np.stack([np.concatenate([a[kept], b[kept]]), np.concatenate([b[kept], a[kept]])])
     ends = ends[:, np.lexsort((ends[1], ends[0]))]
-    return starts_of_counts(np.bincount(ends[0], minlength=len(vi_map.vertices))), ends[1]
+    return table.starts_of_counts(np.bincount(ends[0], minlength=len(vi_map.vertices))), ends[1]
 
 
 def _covisible(vi_map: VIMap, vertex: I64, landmark: I64) -> tuple[I64, I64, I64]:
@@ -217,7 +214,7 @@ def check_metric(vi_map: VIMap, selection: Selection, options: DataOptions) -> N
     if not options.include_inertial:
         return
     for mission in distinct(vi_map.vertices.mission[selection.vertices]).tolist():
-        if not is_metric(vi_map, mission):
+        if not queries.is_metric(vi_map, mission):
             raise UserError(
                 f"mission {to_hex(vi_map.missions.id[mission])}: its scale and gravity are arbitrary, so "
                 "inertial terms cannot apply: import it with --align_to, or give --ba_include_inertial=false"
@@ -260,7 +257,7 @@ def observations(
     sigma = np.maximum(vi_map.keypoints.sigma_px[keypoints], 1e-3)
     scale = np.where(mission == home, options.loss_scale, options.loss_scale_other_mission)
     data = Observations(
-        start=starts_of_counts(np.bincount(landmark, minlength=len(selection.landmarks))),
+        start=table.starts_of_counts(np.bincount(landmark, minlength=len(selection.landmarks))),
         vertex=selection.rows(vertex).astype(np.int32),
         camera=camera.astype(np.int32),
         uv_px=np.ascontiguousarray(vi_map.keypoints.uv_px[keypoints]),
@@ -277,10 +274,10 @@ def retriangulated(
 
     Landmarks whose rays do not intersect in front of all cameras are unchanged.
     """
-    rows = ragged_rows(start, landmarks)
+    rows = table.ragged_rows(start, landmarks)
     origins, directions, valid = rays_in_G(vi_map, selection.keypoints[rows])
-    ray_start = starts_of_counts(np.diff(start)[landmarks])
-    points, ok, _ = triangulate(origins, directions, ray_start)
+    ray_start = table.starts_of_counts(np.diff(start)[landmarks])
+    points, ok, _ = triangulation.triangulate(origins, directions, ray_start)
     owner = np.repeat(np.arange(len(landmarks)), np.diff(ray_start))
     ahead = np.einsum("oi,oi->o", points[owner] - origins, directions) > 0.0
     ok = ok & (np.bincount(owner, ~(ahead & valid), minlength=len(landmarks)) == 0)

@@ -17,9 +17,8 @@ from maplab_py.estimation.codegen.kernels import residual_kernel
 from maplab_py.estimation.imu.inertial_data import InertialData
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.states import ACCEL_BIAS, GYRO_BIAS, States
-from maplab_py.estimation.terms import pose
+from maplab_py.estimation.terms import inertial_calibration, pose
 from maplab_py.estimation.terms.inertial import BiasWalkTerm, InertialTerm
-from maplab_py.estimation.terms.inertial_calibration import CalibratingInertialTerm, imu_blocks
 from maplab_py.estimation.terms.prior import BlockPrior, PosePrior, VertexVectorPrior
 from maplab_py.estimation.terms.protocol import FactorTerm
 from maplab_py.estimation.terms.wheel import WHEEL_SCALE, ScaledRelativePoseTerm, wheel_scale_block
@@ -28,8 +27,7 @@ from maplab_py.progress import Progress
 from maplab_py.sensors import Imu
 from maplab_py.sensors.imu import gravity_mps2
 from maplab_py.sensors.wheels import wheel_scale
-from maplab_py.vimap import MissionSensor, TransformationKind, VIMap, from_hex, to_hex
-from maplab_py.vimap.queries import mission_sensor_id
+from maplab_py.vimap import MissionSensor, TransformationKind, VIMap, from_hex, queries, to_hex
 
 # The difference between measured and estimated positions changes slowly, by the drift of the trajectory;
 # a measurement that differs from the local median of the differences is wrong. So a trajectory may
@@ -191,8 +189,8 @@ def _with_inertial(
         plain = InertialTerm(kernel, data, first, second, g_G)
         return dataclasses.replace(so_far, terms=[*so_far.terms, plain, bias_walk])
     kernel = residual_kernel("inertial_with_intrinsics", inertial_with_intrinsics, progress)
-    states = so_far.states.with_blocks(*imu_blocks(data.imus))
-    term = CalibratingInertialTerm(kernel, data, first, second, g_G, states)
+    states = so_far.states.with_blocks(*inertial_calibration.imu_blocks(data.imus))
+    term = inertial_calibration.CalibratingInertialTerm(kernel, data, first, second, g_G, states)
     return dataclasses.replace(
         so_far, terms=[*so_far.terms, term, bias_walk], states=states, imus=data.imus
     )
@@ -390,7 +388,7 @@ def _sensor_keys(
 
 def _owner(vi_map: VIMap, key: NDArray[np.uint64]) -> tuple[str, str]:
     """Return the ids of the mission's IMU and of the sensor of a key [mission, id words]."""
-    imu_id = mission_sensor_id(vi_map, int(key[0]), MissionSensor.IMU)
+    imu_id = queries.mission_sensor_id(vi_map, int(key[0]), MissionSensor.IMU)
     sensor_id = to_hex(key[1:])
     if sensor_id not in vi_map.sensors.sensors:
         raise MapError(f"sensors.yaml has no sensor {sensor_id}, but measurements name it")

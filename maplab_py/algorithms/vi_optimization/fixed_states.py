@@ -7,12 +7,8 @@ from maplab_py.distinct import distinct
 from maplab_py.estimation.problem import gauge
 from maplab_py.estimation.problem.problem import Problem
 from maplab_py.estimation.states import NODES_PER_VERTEX, ORIENTATION, POSITION, States
-from maplab_py.estimation.terms.cameras import camera_nodes
+from maplab_py.estimation.terms import cameras, pose, prior, protocol, wheel
 from maplab_py.estimation.terms.inertial import InertialTerm
-from maplab_py.estimation.terms.pose import AbsolutePoseTerm
-from maplab_py.estimation.terms.prior import PosePrior
-from maplab_py.estimation.terms.protocol import FactorTerm
-from maplab_py.estimation.terms.wheel import ScaledRelativePoseTerm
 from maplab_py.report import counted
 
 
@@ -27,7 +23,7 @@ def hold_unconstrained(problem: Problem, states: States) -> I64:
         if problem.visual.estimates_cameras:
             data = problem.visual.observations
             used = distinct(data.camera[data.inverse_sigma > 0.0])
-            touched[camera_nodes(states)[used]] = True
+            touched[cameras.camera_nodes(states)[used]] = True
     for term in problem.factors:
         touched[term.nodes.reshape(-1)] = True
     problem.fix(np.flatnonzero(~touched))
@@ -62,9 +58,9 @@ def fix_gauge(
     labels = gauge.clusters(num_vertices, _links(problem, num_vertices))
     is_held = np.zeros(num_vertices, dtype=np.bool_)
     is_held[held] = True
-    anchored = _labels_of(labels, problem, AbsolutePoseTerm)
-    if any(isinstance(t, PosePrior) and t.determines_poses for t in problem.factors):
-        anchored |= _labels_of(labels, problem, PosePrior)
+    anchored = _labels_of(labels, problem, pose.AbsolutePoseTerm)
+    if any(isinstance(t, prior.PosePrior) and t.determines_poses for t in problem.factors):
+        anchored |= _labels_of(labels, problem, prior.PosePrior)
     has_prior = problem.visual is not None and problem.visual.has_landmark_prior
     if has_fixed_landmarks or has_prior:
         anchored |= set(distinct(labels[_observing(problem)]).tolist())
@@ -136,7 +132,7 @@ def _labels_with_scale(labels: I64, problem: Problem) -> set[int]:
     """Return the clusters with factors that know distances; wheels of unknown scale do not."""
     result: set[int] = set()
     for term in problem.factors:
-        if isinstance(term, ScaledRelativePoseTerm):
+        if isinstance(term, wheel.ScaledRelativePoseTerm):
             continue
         vertices = _vertices_of(term, len(labels))
         if vertices is not None:
@@ -144,7 +140,7 @@ def _labels_with_scale(labels: I64, problem: Problem) -> set[int]:
     return result
 
 
-def _vertices_of(term: FactorTerm, num_vertices: int) -> I64 | None:
+def _vertices_of(term: protocol.FactorTerm, num_vertices: int) -> I64 | None:
     """Return the vertices (N, n) of a term; None when it touches other parameters only."""
     is_vertex = term.nodes < NODES_PER_VERTEX * num_vertices
     if not is_vertex.any():

@@ -17,8 +17,7 @@ from maplab_py.algorithms.vi_optimization.reports import VIOptimizationReport
 from maplab_py.array_types import I64, Mask
 from maplab_py.distinct import distinct
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.excerpts import excerpt
+from maplab_py.vimap import VIMap, excerpts
 
 _MIN_SHARED = 5
 """Vertices that share fewer landmarks with the free ones are left out."""
@@ -63,7 +62,7 @@ def optimize_around(
     is_free = is_new | _most_shared(vi_map, is_new, usable & ~is_new, max_free)
     is_fixed = _most_shared(vi_map, is_free, usable & ~is_free, max_fixed)
     is_fixed |= _neighbours(vi_map, is_free)
-    part = excerpt(vi_map, is_free | is_fixed, observed_by=is_free)
+    part = excerpts.excerpt(vi_map, is_free | is_fixed, observed_by=is_free)
     rows = np.flatnonzero(is_fixed[part.vertices])
     result, report = optimize(part.vi_map, options, fixed_vertices=rows, progress=progress)
     sizes = int(np.count_nonzero(is_free)), len(rows)

@@ -12,7 +12,7 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.algorithms.vi_optimization import data_selection, fixed_states
+from maplab_py.algorithms.vi_optimization import data_selection, fixed_states, linear_solver
 from maplab_py.algorithms.vi_optimization.calibration_states import (
     RigCameras,
     parameter_count,
@@ -24,7 +24,6 @@ from maplab_py.algorithms.vi_optimization.factor_terms import (
     landmark_prior,
     prior_terms,
 )
-from maplab_py.algorithms.vi_optimization.linear_solver import make_problem
 from maplab_py.algorithms.vi_optimization.options import (
     DataOptions,
     FixedStates,
@@ -47,9 +46,8 @@ from maplab_py.estimation.states import (
     VELOCITY,
     States,
 )
-from maplab_py.estimation.terms import cameras
+from maplab_py.estimation.terms import cameras, protocol
 from maplab_py.estimation.terms.extension import REGISTERED, ExpressionTerm, ResidualRows
-from maplab_py.estimation.terms.protocol import FactorTerm
 from maplab_py.estimation.terms.visual import VisualTerms
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap
@@ -95,7 +93,7 @@ class MapTerms:
     rejection: OutlierRejection | None
     rig: RigCameras | None
     factors: MapFactors
-    terms: tuple[FactorTerm, ...]  # terms of `factors`, priors and plugins
+    terms: tuple[protocol.FactorTerm, ...]  # terms of `factors`, priors and plugins
 
     def map_problem(self, problem: Problem, held: I64, gauge: str) -> MapProblem:
         """Return the problem of these terms with the data needed to apply its solution to the map."""
@@ -144,7 +142,7 @@ def build(
     """
     parts = collect_terms(vi_map, options, missions=missions, progress=progress)
     states = parts.states
-    problem = make_problem(states, parts.visual, parts.terms, options, progress)
+    problem = linear_solver.make_problem(states, parts.visual, parts.terms, options, progress)
     held = fixed_states.hold_unconstrained(problem, states)
     _fix_by_options(problem, options, states, parts.rig)
     fixed = None
@@ -194,7 +192,7 @@ def collect_terms(
     visual, rejection, rig, states = _visual(vi_map, selection, options, states, progress)
     factors = factor_terms(vi_map, selection, options, states, progress)
     states = factors.states
-    terms: list[FactorTerm] = [
+    terms: list[protocol.FactorTerm] = [
         *factors.terms,
         *prior_terms(states, options),
         *extension_terms(vi_map, selection, options, progress),

@@ -7,18 +7,10 @@ from collections.abc import Callable
 import numpy as np
 
 from maplab_py.algorithms.scale_check import scale_doubts
-from maplab_py.algorithms.vi_optimization.calibration_choice import (
-    freed_note,
-    is_direct,
-    may_free,
-    may_free_more,
-    with_contradicted_freed,
-)
+from maplab_py.algorithms.vi_optimization import calibration_choice, report_building, solution
 from maplab_py.algorithms.vi_optimization.map_problem import MapProblem, build
 from maplab_py.algorithms.vi_optimization.options import SolverFlags, VIOptimizationOptions
-from maplab_py.algorithms.vi_optimization.report_building import make_report
 from maplab_py.algorithms.vi_optimization.reports import CalibratedParameter, VIOptimizationReport
-from maplab_py.algorithms.vi_optimization.solution import apply_states
 from maplab_py.array_types import I64, NDArray
 from maplab_py.estimation.problem.solver import AfterStep, SolverOptions, optimize_states
 from maplab_py.estimation.states import States
@@ -59,15 +51,19 @@ def optimize(
         MapError: Calibrations that the terms need are missing.
     """
     result, report = _optimize(vi_map, options, missions, progress, watch, fixed_vertices)
-    if fixed_vertices is not None or not may_free(options, report):
+    if fixed_vertices is not None or not calibration_choice.may_free(options, report):
         return result, report
-    free = with_contradicted_freed(result, options, missions=missions, progress=progress)
+    free = calibration_choice.with_contradicted_freed(
+        result, options, missions=missions, progress=progress
+    )
     while free != options:
         options = free
         result, more = _optimize(result, options, missions, progress, watch)
         report = _joined(report, more, options)
-        if may_free_more(more):
-            free = with_contradicted_freed(result, options, missions=missions, progress=progress)
+        if calibration_choice.may_free_more(more):
+            free = calibration_choice.with_contradicted_freed(
+                result, options, missions=missions, progress=progress
+            )
     return result, report
 
 
@@ -79,9 +75,9 @@ def contradicted_calibration(vi_map: VIMap, progress: Progress = SILENT) -> bool
     options = VIOptimizationOptions(calibration="auto", num_iterations=_FEW_ITERATIONS)
     quiet = _Quiet(progress)
     result, report = _optimize(vi_map, options, None, quiet, None)
-    if not is_direct(report):
+    if not calibration_choice.is_direct(report):
         return False
-    return with_contradicted_freed(result, options, progress=quiet) != options
+    return calibration_choice.with_contradicted_freed(result, options, progress=quiet) != options
 
 
 def _joined(
@@ -91,7 +87,7 @@ def _joined(
     second = dataclasses.replace(
         second, calibration=_changes(first.calibration, second.calibration)
     )
-    note = freed_note(options, second)
+    note = calibration_choice.freed_note(options, second)
     before = {row.mission: row for row in first.missions}
     missions = [
         dataclasses.replace(
@@ -159,8 +155,8 @@ def _optimize(
         _Quiet(progress) if quiet else progress,
         _after_step(map_problem, options, watch),
     )
-    result = apply_states(map_problem, final, options)
-    report = make_report(map_problem, final, summary)
+    result = solution.apply_states(map_problem, final, options)
+    report = report_building.make_report(map_problem, final, summary)
     doubts = [report.note] if report.note else []
     if report.median_reprojection_after_px > _DOUBTFUL_ERROR_PX:
         doubts.append(
@@ -188,7 +184,7 @@ def _after_step(
 
     def after_step(iteration: int, states: States) -> bool:
         if iteration % every == 0:
-            watch(lambda: apply_states(map_problem, states, options))
+            watch(lambda: solution.apply_states(map_problem, states, options))
         return reject is not None and reject(iteration, states)
 
     return after_step

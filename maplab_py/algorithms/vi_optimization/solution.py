@@ -6,8 +6,7 @@ from maplab_py.algorithms.vi_optimization import calibration_states
 from maplab_py.algorithms.vi_optimization.map_problem import MapProblem
 from maplab_py.algorithms.vi_optimization.options import FixedStates
 from maplab_py.estimation.states import States
-from maplab_py.estimation.terms.cameras import EXTRINSICS
-from maplab_py.estimation.terms.pose import SWITCH
+from maplab_py.estimation.terms import cameras, pose
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import SensorSet
 from maplab_py.vimap import LandmarkQuality, VIMap
@@ -23,10 +22,10 @@ def apply_states(map_problem: MapProblem, states: States, options: FixedStates) 
     if not options.absolute_pose_sensor_fix_mission_baseframes:
         vi_map = _with_base_frames(vi_map, map_problem, states)
     vi_map = _with_vertices(vi_map, map_problem, states)
-    if SWITCH in states.blocks:
+    if pose.SWITCH in states.blocks:
         edges = vi_map.loop_closure_edges
         switch = np.array(edges.switch_variable)
-        switch[map_problem.factors.switched_edges] = states.blocks[SWITCH].values[:, 0]
+        switch[map_problem.factors.switched_edges] = states.blocks[pose.SWITCH].values[:, 0]
         vi_map = vi_map.replace(loop_closure_edges=edges.replace(switch_variable=switch))
     vi_map = _with_landmarks(vi_map, map_problem, states)
     return _with_landmarks_kept(map_problem, vi_map) if options.fix_landmark_positions else vi_map
@@ -35,7 +34,7 @@ def apply_states(map_problem: MapProblem, states: States, options: FixedStates) 
 def with_estimated_sensors(map_problem: MapProblem, states: States) -> SensorSet:
     """Return the map's sensors with the calibrations of the states."""
     sensors = map_problem.vi_map.sensors
-    if map_problem.rig is not None and EXTRINSICS in states.blocks:
+    if map_problem.rig is not None and cameras.EXTRINSICS in states.blocks:
         sensors = calibration_states.with_cameras(sensors, map_problem.rig, states)
     sensors = calibration_states.with_imus(sensors, map_problem.factors.imus, states)
     sensors = calibration_states.with_wheels(sensors, map_problem.factors.wheels, states)

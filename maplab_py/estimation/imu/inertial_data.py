@@ -12,8 +12,7 @@ from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
 from maplab_py.estimation.kernels.imu import EdgeSamples
 from maplab_py.sensors import Imu
-from maplab_py.vimap import VIMap, ragged_rows, starts_of_counts, to_hex
-from maplab_py.vimap.tables import MissionSensor
+from maplab_py.vimap import VIMap, ragged_rows, starts_of_counts, tables, to_hex
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -61,7 +60,7 @@ class InertialData:
         rows = np.arange(len(table)) if edges is None else np.asarray(edges, dtype=np.int64)
         samples = ragged_rows(vi_map.sample_start, rows)
         mission = vi_map.vertices.mission[table.from_vertex[rows]]
-        sensor_id = vi_map.missions.sensor_id[mission, MissionSensor.IMU]
+        sensor_id = vi_map.missions.sensor_id[mission, tables.MissionSensor.IMU]
         ids, imu_of_edge = np.unique(sensor_id, axis=0, return_inverse=True)
         return cls(
             sample_start=starts_of_counts(table.sample_count[rows]),

@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from maplab_py.array_types import F64, I64
+from maplab_py.estimation.linear import protocol, supernodal_solver
 from maplab_py.estimation.linear.ordering import AUTOMATIC
 from maplab_py.estimation.linear.pattern import BlockPattern, joint_covariance
-from maplab_py.estimation.linear.protocol import FactorStatistics
-from maplab_py.estimation.linear.supernodal_solver import SupernodalCholesky
 
 
 class BlockCholesky:
@@ -37,14 +36,14 @@ class BlockCholesky:
             NotEnoughMemory: The factor would not fit into memory.
         """
         self._pattern = pattern = BlockPattern.checked(block_rows, block_cols, num_nodes, node_size)
-        self._solver = SupernodalCholesky(
+        self._solver = supernodal_solver.SupernodalCholesky(
             pattern.rows, pattern.cols, num_nodes, node_size, ordering
         )
         self._places = self._solver.places(pattern.rows, pattern.cols)
         self._values: F64 | None = None
 
     @property
-    def statistics(self) -> FactorStatistics:
+    def statistics(self) -> protocol.FactorStatistics:
         """Size and cost of the factorisation."""
         return self._solver.statistics
 
@@ -93,7 +92,7 @@ def compile_kernels() -> None:
     solver.solve(np.ones(6))
     solver.solve(np.ones((6, 2)))
     node = np.zeros(1, dtype=np.int32)
-    matrix = SupernodalCholesky(node, node, 1, 3)
+    matrix = supernodal_solver.SupernodalCholesky(node, node, 1, 3)
     matrix.clear()
     matrix.add_to_diagonal(np.ones((1, 3)))
     matrix.project(np.ones(1, dtype=np.bool_), np.eye(3)[None], np.ones(1))

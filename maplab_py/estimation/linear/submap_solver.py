@@ -15,11 +15,8 @@ import numpy as np
 
 from maplab_py.array_types import F64, I32, I64, Mask
 from maplab_py.errors import EstimationError
-from maplab_py.estimation.linear import block_storage, supernodal
-from maplab_py.estimation.linear.dense_kernels import Blas
+from maplab_py.estimation.linear import block_storage, dense_kernels, pattern, protocol, supernodal
 from maplab_py.estimation.linear.ordering import AUTOMATIC
-from maplab_py.estimation.linear.pattern import BlockPattern
-from maplab_py.estimation.linear.protocol import FactorStatistics, NotPositiveDefinite
 from maplab_py.estimation.linear.single_solve import solve_backwards, solve_forwards
 from maplab_py.estimation.linear.symbolic import FrontPlan, SymbolicFactor, analyse, most_below
 from maplab_py.estimation.linear.threads import single_blas_thread
@@ -262,7 +259,7 @@ class SubmapCholesky:
         num_nodes: int,
         node_size: int,
         count: int,
-        ordering: Callable[[BlockPattern], I64] = AUTOMATIC,
+        ordering: Callable[[pattern.BlockPattern], I64] = AUTOMATIC,
         tell: Callable[[str], None] | None = None,
     ) -> None:
         """Analyse the structure of the lower blocks at rows and cols, each (B,).
@@ -279,8 +276,8 @@ class SubmapCholesky:
         Raises:
             NotEnoughMemory: A submap with the separators above it does not fit.
         """
-        symbolic = analyse(BlockPattern.checked(rows, cols, num_nodes, node_size), ordering)
-        self.statistics: FactorStatistics = symbolic.statistics
+        symbolic = analyse(pattern.BlockPattern.checked(rows, cols, num_nodes, node_size), ordering)
+        self.statistics: protocol.FactorStatistics = symbolic.statistics
         self.submaps = cut_into_submaps(symbolic, count)
         self.plan = self.submaps.plan
         self.count = sum(self.submaps.is_submap)
@@ -302,7 +299,7 @@ class SubmapCholesky:
             node_size, position, column_start + shift[self.node_part], leading
         )
         self._begins = [self.submaps.begins_with(part) for part in range(len(self.submaps))]
-        self._blas = Blas.workspace()
+        self._blas = dense_kernels.Blas.workspace()
         self._file: Any = tempfile.TemporaryFile(prefix="maplab-submaps-", buffering=0)  # noqa: SIM115
         self._x = np.zeros(num_nodes * node_size)  # in elimination order
         self.select(0)
@@ -373,7 +370,7 @@ class SubmapCholesky:
                 self._placed, self.numbers, self._scratch, self._blas, *inner
             )
             if bad >= 0:
-                raise NotPositiveDefinite(int(self.plan.order[bad]))
+                raise protocol.NotPositiveDefinite(int(self.plan.order[bad]))
             solve_forwards(self._placed, self.numbers, self._x, *inner)
         if self._selected + 1 < len(self.submaps):
             self._keep()

@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.kernels.loss import loss_and_weight
-from maplab_py.estimation.linear.protocol import NotPositiveDefinite
-from maplab_py.estimation.linear.threads import single_blas_thread
+from maplab_py.estimation.linear import protocol, threads
 from maplab_py.estimation.problem.problem import Problem
 from maplab_py.estimation.states import States, pose_nodes
 from maplab_py.estimation.terms.visual import VisualTerms
@@ -37,12 +36,12 @@ class Marginals:
             EstimationError: They are singular; the message names where.
         """
         self._problem, self._states = problem, states
-        with single_blas_thread():
+        with threads.single_blas_thread():
             problem.relinearize(states)
             linear = problem.linearize(states, _LANDMARK_DAMPING)
             try:
                 problem.factorise(linear, 0.0)
-            except NotPositiveDefinite as error:
+            except protocol.NotPositiveDefinite as error:
                 raise EstimationError(
                     "no covariance: the measurements do not determine "
                     f"{problem.name_of_node(states, error.node)}; fix it or add a prior"
@@ -51,7 +50,7 @@ class Marginals:
     def nodes(self, nodes: ArrayLike) -> F64:
         """Return the joint covariance (3 k, 3 k) of nodes (k,), in the given order."""
         chosen = np.asarray(nodes, dtype=np.int64).reshape(-1)
-        with single_blas_thread():
+        with threads.single_blas_thread():
             return self._problem.marginal_covariance(chosen)
 
     def block(self, name: str) -> F64:

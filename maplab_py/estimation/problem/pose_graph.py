@@ -16,9 +16,8 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import EstimationError
-from maplab_py.estimation.linear.block_cholesky import BlockCholesky
+from maplab_py.estimation.linear import block_cholesky, protocol
 from maplab_py.estimation.linear.ordering import Ordering, OrderingKind
-from maplab_py.estimation.linear.protocol import NotPositiveDefinite
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.problem.protocol import Step
 from maplab_py.estimation.symbolic.sources import PoseError
@@ -115,7 +114,7 @@ class PoseGraphProblem:
         )
         self._diagonal = np.einsum("nii->ni", self._system.diagonal_block)  # a view
         nodes = np.arange(size)
-        self._solver = BlockCholesky(
+        self._solver = block_cholesky.BlockCholesky(
             np.concatenate([node[kept].max(axis=1), nodes]),
             np.concatenate([node[kept].min(axis=1), nodes]),
             size,
@@ -226,7 +225,7 @@ class PoseGraphProblem:
         self.set_second_order(False)
         linear = self.linearize(T_G_I, 0.0)
         for damping in _SMALL_DAMPING:
-            with contextlib.suppress(NotPositiveDefinite):
+            with contextlib.suppress(protocol.NotPositiveDefinite):
                 self._factorise(damping * _positive(linear.system.diagonal))
                 break
         else:

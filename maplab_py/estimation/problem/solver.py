@@ -9,8 +9,7 @@ from typing import Generic
 import numpy as np
 
 from maplab_py.errors import EstimationError
-from maplab_py.estimation.linear.protocol import NotPositiveDefinite
-from maplab_py.estimation.linear.threads import single_blas_thread
+from maplab_py.estimation.linear import protocol, threads
 from maplab_py.estimation.problem import trust_region
 from maplab_py.estimation.problem.protocol import L, LeastSquares, S, Step
 from maplab_py.estimation.states import States
@@ -153,7 +152,7 @@ def optimize_states(
         EstimationError: The cost is not finite at the beginning.
     """
     iterations = optimizing_states(problem, states, options, progress, after_step)
-    with single_blas_thread():
+    with threads.single_blas_thread():
         while True:
             try:
                 next(iterations)
@@ -212,7 +211,7 @@ def _iterate(
         step = run.try_step()
         if step.refine is not None and run.would_stop(step):
             step = step.refine()
-    except NotPositiveDefinite as error:
+    except protocol.NotPositiveDefinite as error:
         run.singular.append(error.node)
         step = Step(run.states, {"": np.inf}, 0.0, np.inf)
     new_cost = step.cost

@@ -18,11 +18,9 @@ import numpy as np
 
 from maplab_py.array_types import F64, I32, I64
 from maplab_py.estimation.kernels.visual_arguments import VisualTarget
+from maplab_py.estimation.linear import protocol, submap_solver, supernodal_solver
 from maplab_py.estimation.linear.nested_dissection import has_metis
 from maplab_py.estimation.linear.ordering import Ordering, OrderingKind
-from maplab_py.estimation.linear.protocol import NotPositiveDefinite
-from maplab_py.estimation.linear.submap_solver import SubmapCholesky
-from maplab_py.estimation.linear.supernodal_solver import BlockPlaces, SupernodalCholesky
 from maplab_py.estimation.problem.problem import (
     LARGEST_DAMPED,
     SMALLEST_DAMPED,
@@ -61,7 +59,7 @@ class _FactorPart:
     """The factors of one term that belong to a part."""
 
     rows: I64  # (f,)
-    places: BlockPlaces
+    places: supernodal_solver.BlockPlaces
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -107,7 +105,7 @@ class SubmapProblem(Problem):
         self._make_direct = make_direct or partial(Problem, states, visual, factors)
         self._covariance_problem: Problem | None = None
         self._eliminated: tuple[Linearization, float] | None = None  # and damping of the nodes
-        self._singular: NotPositiveDefinite | None = None
+        self._singular: protocol.NotPositiveDefinite | None = None
         if ordering is OrderingKind.AUTO and (has_metis() or visual is not None):
             ordering = OrderingKind.NESTED_DISSECTION
         super().__init__(states, visual, factors, ordering, tell)
@@ -116,7 +114,7 @@ class SubmapProblem(Problem):
         rows, cols = self.block_places(states)
         if self.visual is not None:
             self.visual.forget_plan()
-        self._submaps = SubmapCholesky(
+        self._submaps = submap_solver.SubmapCholesky(
             rows, cols, self.num_nodes, 3, self._wanted, ordering, self._tell
         )
         del rows, cols
@@ -159,7 +157,7 @@ class SubmapProblem(Problem):
         block_rows, block_cols = factor_terms.block_places(term.nodes[rows])
         short_rows, short_cols = block_rows.astype(np.int32), block_cols.astype(np.int32)
         places = self._submaps.places(short_rows, short_cols)
-        return _FactorPart(rows, BlockPlaces(short_rows, short_cols, places))
+        return _FactorPart(rows, supernodal_solver.BlockPlaces(short_rows, short_cols, places))
 
     @property
     def num_submaps(self) -> int:
@@ -167,7 +165,7 @@ class SubmapProblem(Problem):
         return self._submaps.count
 
     @property
-    def solver(self) -> SupernodalCholesky | None:
+    def solver(self) -> supernodal_solver.SupernodalCholesky | None:
         """None: the matrix is never in one storage."""
         return None
 
@@ -206,7 +204,7 @@ class SubmapProblem(Problem):
             if self._singular is None:
                 try:
                     self._submaps.eliminate()
-                except NotPositiveDefinite as error:
+                except protocol.NotPositiveDefinite as error:
                     self._singular = error
         linear = Linearization(states, landmark_damping, gradient, diagonal, evaluated, costs)
         self._eliminated = linear, damping

@@ -7,8 +7,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64
 from maplab_py.estimation.blocks import Manifold, ParameterBlock, ParameterBlocks
-from maplab_py.estimation.imu.inertial_data import InertialData
-from maplab_py.estimation.imu.preintegration import integrate
+from maplab_py.estimation.imu import inertial_data, preintegration
 from maplab_py.estimation.states import States
 from maplab_py.estimation.terms.inertial import FLOOR, InertialTerm, column_major
 from maplab_py.geometry import so3, symmetric
@@ -58,7 +57,7 @@ class CalibratingInertialTerm(InertialTerm):
     def __init__(
         self,
         kernel: ModuleType,
-        data: InertialData,
+        data: inertial_data.InertialData,
         first: I64,
         second: I64,
         g_G: F64,
@@ -94,7 +93,7 @@ class CalibratingInertialTerm(InertialTerm):
             for imu, values in zip(self._data.imus, intrinsics, strict=True)
         )
         data = dataclasses.replace(self._data, imus=imus)
-        measured = integrate(data, *self._biases, with_intrinsics=True)
+        measured = preintegration.integrate(data, *self._biases, with_intrinsics=True)
         assert measured.jacobian_intrinsics is not None
         self._set_measured(measured, column_major(measured.jacobian_intrinsics))
         return measured.covariance

@@ -8,8 +8,7 @@ from maplab_py.array_types import F64, I64
 from maplab_py.estimation.blocks import ParameterBlock
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.states import States
-from maplab_py.estimation.terms.pose import RelativePoseTerm
-from maplab_py.estimation.terms.protocol import FixedMeasurements, evaluated
+from maplab_py.estimation.terms import pose, protocol
 
 WHEEL_SCALE = "wheel scale"
 _SMALLEST, _LARGEST = 0.01, 100.0
@@ -22,14 +21,14 @@ def wheel_scale_block(scales: F64) -> ParameterBlock:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class ScaledRelativePoseTerm(FixedMeasurements):
+class ScaledRelativePoseTerm(protocol.FixedMeasurements):
     """Relative poses T_SA_SB whose measured positions are scaled by a state.
 
     The kernel of the poses is `scaled_relative_pose`, or with a mounting
     `scaled_relative_pose_with_mounting`.
     """
 
-    poses: RelativePoseTerm
+    poses: pose.RelativePoseTerm
     sensor: I64  # (N,) rows of the block of scales
     scale_nodes: I64  # (N, 1)
 
@@ -53,4 +52,4 @@ class ScaledRelativePoseTerm(FixedMeasurements):
         scale = np.zeros((len(self.sensor), 3))
         scale[:, 0] = states.blocks[WHEEL_SCALE].values[self.sensor, 0]
         arguments = np.concatenate([self.poses.arguments(states), scale], axis=1)
-        return evaluated(self.poses.kernel, arguments, self.poses.whitening)
+        return protocol.evaluated(self.poses.kernel, arguments, self.poses.whitening)

@@ -6,8 +6,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import MapError
-from maplab_py.estimation.imu.inertial_data import InertialData
-from maplab_py.estimation.imu.preintegration import Preintegrated, integrate
+from maplab_py.estimation.imu import inertial_data, preintegration
 from maplab_py.estimation.terms.inertial import measured_arguments, outdated_edges, whitening
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Imu
@@ -170,15 +169,15 @@ class InertialChain:
         residual, jacobian = self._kernel.evaluated(arguments, self._whitening[edges])
         return residual, jacobian
 
-    def _integrated(self, samples: Samples, biases: F64) -> Preintegrated:
-        data = InertialData(
+    def _integrated(self, samples: Samples, biases: F64) -> preintegration.Preintegrated:
+        data = inertial_data.InertialData(
             sample_start=starts_of_counts(np.array([len(times_ns) for times_ns, _ in samples])),
             timestamp_ns=np.concatenate([times_ns for times_ns, _ in samples], dtype=np.int64),
             accel_gyro=np.concatenate([values for _, values in samples], dtype=np.float64),
             imus=(self._imu,),
             imu_of_edge=np.zeros(len(samples), dtype=np.int64),
         )
-        return integrate(data, biases[:, :3], biases[:, 3:])
+        return preintegration.integrate(data, biases[:, :3], biases[:, 3:])
 
     def _integrate_stale(self) -> None:
         """Integrate edges whose samples are new or have been joined."""

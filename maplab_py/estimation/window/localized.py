@@ -12,12 +12,11 @@ from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.kernels.window_arguments import FRAME_SIZE
 from maplab_py.estimation.linear.protocol import NotPositiveDefinite
+from maplab_py.estimation.window import map_tracks, smoother
 from maplab_py.estimation.window.calibration import WindowCalibration
 from maplab_py.estimation.window.map_terms import MAP_GATE_CHI2, MapTerms, contradicted_unless_most
-from maplab_py.estimation.window.map_tracks import MapMatches, MapTracks
 from maplab_py.estimation.window.options import MapRule, WindowOptions
 from maplab_py.estimation.window.problem import WindowProblem
-from maplab_py.estimation.window.smoother import FixedLagSmoother
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Camera, Imu
 
@@ -37,7 +36,7 @@ class MapEstimate:
     median_error_px: float  # of them; nan without any
 
 
-class LocalizedSmoother(FixedLagSmoother):
+class LocalizedSmoother(smoother.FixedLagSmoother):
     """A fixed-lag smoother that estimates T_G_M, too, from when it is given one.
 
     Until then it does what `FixedLagSmoother` does, bit by bit.
@@ -55,7 +54,7 @@ class LocalizedSmoother(FixedLagSmoother):
         """Prepare as `FixedLagSmoother` does."""
         super().__init__(cameras, T_I_C, imu, options, calibration)
         self.rule = rule or MapRule()
-        self.map_tracks = MapTracks(estimates_landmarks=self.rule.estimates_landmarks)
+        self.map_tracks = map_tracks.MapTracks(estimates_landmarks=self.rule.estimates_landmarks)
         self._used: I64 = np.zeros(0, dtype=np.int64)  # associations of the latest terms
         self._map_rows = self._used  # of these, whose landmarks are states
         self._latest_terms: MapTerms | None = None
@@ -101,7 +100,7 @@ class LocalizedSmoother(FixedLagSmoother):
         self._states = dataclasses.replace(self._states, T_G_M=np.zeros((0, 7)), p_G=none)
         self._estimate = None
 
-    def associate(self, matches: MapMatches) -> int:
+    def associate(self, matches: map_tracks.MapMatches) -> int:
         """Let whole tracks observe landmarks of the map from the next update on; return how many did.
 
         A track stops being a landmark of the odometry: none of its keypoints enters twice.

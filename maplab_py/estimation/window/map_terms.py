@@ -13,12 +13,7 @@ import numpy as np
 from maplab_py.array_types import F64, I32, I64, Mask
 from maplab_py.estimation.codegen.kernels import window_kernels
 from maplab_py.estimation.kernels import map_observations as kernels
-from maplab_py.estimation.kernels.window_arguments import (
-    FRAME_SIZE,
-    DenseSystem,
-    MapCameras,
-    MapData,
-)
+from maplab_py.estimation.kernels import window_arguments
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.terms.cameras import Cameras
 from maplab_py.estimation.window.options import WindowOptions
@@ -102,13 +97,13 @@ class MapTerms:
             tilt_sigma_rad: How level the frames G and M are to each other; infinite = not stated.
         """
         self.observations = observations
-        self._data = MapData(
+        self._data = window_arguments.MapData(
             observations.frame, observations.camera, observations.landmark,
             np.ascontiguousarray(observations.uv_px), 1.0 / observations.sigma_px,
         )  # fmt: skip
         table = Cameras.of(cameras, T_I_C)
         limits = np.array([visibility_limits(camera) for camera in cameras]).reshape(-1, 4)
-        self._cameras = MapCameras(table.T_I_C, table.parameters, limits)
+        self._cameras = window_arguments.MapCameras(table.T_I_C, table.parameters, limits)
         self._huber2, self._tilt_weight = huber_sigmas**2, 1.0 / tilt_sigma_rad
         self._latest: tuple[WindowStates, MapResiduals] | None = None
         self.estimates_landmarks = observations.information_G is not None and len(observations) > 0
@@ -144,7 +139,7 @@ class MapTerms:
         return self._costs(rho, tilt, states)
 
     def add_to(
-        self, system: DenseSystem, states: WindowStates, at: WindowStates
+        self, system: window_arguments.DenseSystem, states: WindowStates, at: WindowStates
     ) -> tuple[MapElimination | None, dict[str, float]]:
         """Add the normal equations, landmarks eliminated; return how to step these, and the costs.
 
@@ -267,8 +262,8 @@ def _columns(frames: int, calibration: int) -> I64:
 
     Between them are those of the calibration, which observations of a map take for known.
     """
-    of_frames = FRAME_SIZE * np.arange(frames)[:, None] + np.arange(6)
-    of_base = FRAME_SIZE * frames + calibration + np.arange(6)
+    of_frames = window_arguments.FRAME_SIZE * np.arange(frames)[:, None] + np.arange(6)
+    of_base = window_arguments.FRAME_SIZE * frames + calibration + np.arange(6)
     return np.concatenate([of_frames.reshape(-1), of_base])
 
 

@@ -19,6 +19,7 @@ from maplab_py.estimation.kernels.window_arguments import WindowPoint
 from maplab_py.estimation.linear.threads import single_thread
 from maplab_py.estimation.problem.solver import SolverOptions, optimize_states
 from maplab_py.estimation.symbolic import sources
+from maplab_py.estimation.window import inertial, keyframes, marginalization, triangulation, turning
 from maplab_py.estimation.window.calibration import FrameTimes, WindowCalibration
 from maplab_py.estimation.window.cameras import BackProjection, CameraPoses
 from maplab_py.estimation.window.factors import FrameFactors, Standstill
@@ -29,17 +30,12 @@ from maplab_py.estimation.window.frame import (
     WindowFrame,
     WindowUpdate,
 )
-from maplab_py.estimation.window.inertial import InertialChain
-from maplab_py.estimation.window.keyframes import needs_keyframe
 from maplab_py.estimation.window.map_terms import MapTerms
-from maplab_py.estimation.window.marginalization import marginalized
 from maplab_py.estimation.window.options import WindowOptions
 from maplab_py.estimation.window.prior import WindowPrior
 from maplab_py.estimation.window.problem import WindowProblem
 from maplab_py.estimation.window.states import WindowStates
 from maplab_py.estimation.window.tracks import Observations, Tracks
-from maplab_py.estimation.window.triangulation import Triangulator
-from maplab_py.estimation.window.turning import is_on_the_spot, shows_parallax
 from maplab_py.progress import SILENT
 from maplab_py.sensors import Camera, Imu
 from maplab_py.vimap.nav_state import NavState
@@ -82,10 +78,10 @@ class FixedLagSmoother:
         )
         self._kernels = window_kernels()
         self._back_projection = BackProjection(self._kernels, self.calibration)
-        self._chain = InertialChain(residual_kernel("inertial", sources.inertial), imu)
+        self._chain = inertial.InertialChain(residual_kernel("inertial", sources.inertial), imu)
         still = residual_kernel("relative_pose", sources.relative_pose)
         self._standstill = Standstill(still, options.standstill)
-        self._triangulator = Triangulator(self._kernels, options)
+        self._triangulator = triangulation.Triangulator(self._kernels, options)
         self.tracks = Tracks()
         self._inverse_depth = 0.0  # median of landmarks [1/m], 0 = not known yet
         self.newest_covariance: F64 = np.full((15, 15), np.inf)  # order [p, theta, v, b_g, b_a]
@@ -225,7 +221,7 @@ class FixedLagSmoother:
         T_M_I, new_motion = self._chain.predict(self._states.T_M_I[-1], motion)
         self._states = self._states.with_frame(T_M_I, new_motion)
         self._prior = self._prior.with_frame(T_M_I, new_motion)
-        if frame.motion is Motion.TURNING and shows_parallax(
+        if frame.motion is Motion.TURNING and turning.shows_parallax(
             frame, self._frames.time_ns, self.tracks, self._states.T_M_I, self._cameras.T_I_C,
             self._back_projection,
         ):  # fmt: skip
@@ -240,7 +236,7 @@ class FixedLagSmoother:
         return (frame.time_ns - int(self._frames.time_ns[-2])) * 1e-9 <= self.options.max_joined_s
 
     def _append_frame(self, frame: WindowFrame, *, is_keyframe: bool) -> None:
-        turns, is_sure = is_on_the_spot(
+        turns, is_sure = turning.is_on_the_spot(
             frame, self._states.motion[-1], self.newest_covariance, self.options
         )
         rests = frame.motion is Motion.RESTING or is_sure
@@ -389,7 +385,7 @@ class FixedLagSmoother:
         if motion is Motion.RESTING:
             return False
         last = int(np.flatnonzero(self._frames.is_keyframe)[-1])
-        return needs_keyframe(
+        return keyframes.needs_keyframe(
             self.tracks, self._states.T_M_I, self._cameras.T_I_C, last, self.options
         )
 
@@ -455,7 +451,7 @@ class FixedLagSmoother:
     def _marginalize(self, rows: I64, frame: int | None, map_terms: MapTerms | None = None) -> None:
         """Put all that landmarks (rows) and a frame say about other states into the prior."""
         problem, _, _ = self._problem(rows, map_terms)
-        self._prior = marginalized(problem, self._prior, self._states, frame=frame)
+        self._prior = marginalization.marginalized(problem, self._prior, self._states, frame=frame)
 
     def _release(self, frame: int) -> None:
         self._released.append(self._nav_state(frame))

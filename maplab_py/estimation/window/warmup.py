@@ -16,9 +16,8 @@ from maplab_py.estimation.kernels.window_arguments import (
     WindowRule,
 )
 from maplab_py.estimation.loss import Loss
+from maplab_py.estimation.window import cameras, map_terms
 from maplab_py.estimation.window.calibration import FrameTimes, WindowCalibration
-from maplab_py.estimation.window.cameras import BackProjection, CameraPoses
-from maplab_py.estimation.window.map_terms import MapObservations, MapTerms
 from maplab_py.estimation.window.states import WindowStates
 from maplab_py.geometry import se3
 from maplab_py.sensors import Camera, Distortion, Projection
@@ -68,19 +67,19 @@ def _run_landmarks() -> None:
     new = at._replace(h=np.empty_like(states.h))
     module.substitute(data, at, rule, kept, np.zeros(2 * FRAME_SIZE), new)
     module.evaluate(data, at, np.empty((2, 2)))
-    BackProjection(module, calibration).rays(row, uv)
+    cameras.BackProjection(module, calibration).rays(row, uv)
 
 
 def _run_map() -> None:
     """Compile what all observations of a map need, whatever the camera."""
     states, system = _states(), DenseSystem.zeros(2 * FRAME_SIZE + 6)
     nothing = np.zeros(0, dtype=np.int32)
-    observations = MapObservations(
+    observations = map_terms.MapObservations(
         np.zeros(1, dtype=np.int64), nothing, nothing, np.zeros((0, 2)), np.zeros(0),
         np.zeros((0, 3)), None,
     )  # fmt: skip
     localized = dataclasses.replace(states, T_G_M=se3.identity(1))
-    terms = MapTerms(observations, (_camera(),), se3.identity(1), huber_sigmas=1.0)
+    terms = map_terms.MapTerms(observations, (_camera(),), se3.identity(1), huber_sigmas=1.0)
     terms.add_to(system, localized, localized)
 
 
@@ -90,7 +89,7 @@ def _run_frames() -> None:
     kernels.add_factors(np.ones((1, 3)), np.ones((1, 3, 3)), first_row, system)
     kernels.add_walks(states.motion, np.ones((1, 2)), system)
     states.moved(states.offsets(states.T_M_I, states.motion), states.h)
-    CameraPoses.of(states.T_M_I, se3.identity(1))
+    cameras.CameraPoses.of(states.T_M_I, se3.identity(1))
     origin, start = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), np.array([0, 2], dtype=np.int64)
     ray = np.array([[0.0, 0.0, 1.0], [-0.6, 0.0, 0.8]])
     kernels.triangulate(origin, ray, start, np.empty((1, 3)), np.empty(1, dtype=np.bool_))

@@ -12,12 +12,10 @@ from maplab_py.interop.bags import sensor_messages
 from maplab_py.interop.bags.options import BagExportOptions, BagReport, written_topics
 from maplab_py.interop.bags.poses import TF_TOPIC, TF_TYPE
 from maplab_py.interop.ply import parse_ply
-from maplab_py.interop.recordings import bag_layouts, bag_writing
-from maplab_py.interop.recordings.map_replay import mission_sample_rows
+from maplab_py.interop.recordings import bag_layouts, bag_writing, map_replay
 from maplab_py.progress import SILENT, Progress
 from maplab_py.storage.resources.store import ResourceStore
-from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap, to_hex
-from maplab_py.vimap.queries import mission_labels, mission_sensor_id, resources_of
+from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap, queries, to_hex
 
 IMAGES, _DEPTH, _CLOUDS = (0, 4), (8,), (16, 17, 21)
 """Numbers of the resource types."""
@@ -92,7 +90,7 @@ def export_bag(
     return BagReport(
         bag=path,
         format=kind.value,
-        missions=(mission_labels(vi_map)[mission],),
+        missions=(queries.mission_labels(vi_map)[mission],),
         messages=total,
         copied_messages=0,
         topics=written_topics(counts),
@@ -118,9 +116,9 @@ class MissionStreams:
         start, stop = vi_map.vertex_start[mission : mission + 2].tolist()
         self._vertices = slice(start, stop)
         self._times_ns: I64 = vi_map.vertices.timestamp_ns[start:stop]
-        rig_id = mission_sensor_id(vi_map, mission, MissionSensor.NCAMERA)
+        rig_id = queries.mission_sensor_id(vi_map, mission, MissionSensor.NCAMERA)
         self._cameras = vi_map.sensors.camera_rig(rig_id).cameras if rig_id else ()
-        self._imu_id = mission_sensor_id(vi_map, mission, MissionSensor.IMU)
+        self._imu_id = queries.mission_sensor_id(vi_map, mission, MissionSensor.IMU)
         self.notes: list[str] = []
 
     def poses(self) -> list[MessageStream]:
@@ -173,7 +171,7 @@ class MissionStreams:
         """IMU samples, each once."""
         if not self._imu_id:
             return []
-        rows = mission_sample_rows(self._map, self._mission)
+        rows = map_replay.mission_sample_rows(self._map, self._mission)
         times_ns = self._map.imu_samples.timestamp_ns[rows]
         samples = self._map.imu_samples.accel_gyro[rows]
         messages = bag_layouts.imu_messages(
@@ -185,7 +183,7 @@ class MissionStreams:
     def images(self, kinds: tuple[int, ...], name: str) -> list[MessageStream]:
         """Images of frames, of some types of resources, and the calibration of their cameras."""
         vi_map, streams = self._map, list[MessageStream]()
-        chosen = resources_of(vi_map, kinds, np.array([self._mission]))
+        chosen = queries.resources_of(vi_map, kinds, np.array([self._mission]))
         chosen &= vi_map.resources.owner_kind == ResourceOwner.FRAME
         resources = np.flatnonzero(chosen)
         frames = vi_map.resources.owner[resources]
@@ -213,7 +211,7 @@ class MissionStreams:
     def clouds(self) -> list[MessageStream]:
         """Clouds of sensors."""
         vi_map, table, streams = self._map, self._map.resources, list[MessageStream]()
-        chosen = resources_of(vi_map, _CLOUDS, np.array([self._mission]))
+        chosen = queries.resources_of(vi_map, _CLOUDS, np.array([self._mission]))
         chosen &= table.owner_kind == ResourceOwner.SENSOR
         rows = np.flatnonzero(chosen)
         for number, sensor_id in enumerate(np.unique(table.sensor_id[rows], axis=0)):

@@ -15,15 +15,13 @@ from maplab_py.errors import MapError, UserError
 from maplab_py.interop.bags.options import BagImport, BagImportOptions
 from maplab_py.interop.bags.sensor_messages import CAMERA_INFO, CLOUD, COMPRESSED, IMAGE, cloud_of
 from maplab_py.interop.images import CONTAINER_BITS, sampled
-from maplab_py.interop.recordings import bag_files
+from maplab_py.interop.recordings import bag_files, protocol
 from maplab_py.interop.recordings import images as recorded_images
-from maplab_py.interop.recordings.protocol import CameraImage
 from maplab_py.interop.resources import matching, point_clouds
 from maplab_py.interop.resources.depth_maps import MM_PER_M, RAW_DEPTH_MAPS, encoded_depth
 from maplab_py.interop.resources.images import RAW_COLOUR, RAW_GREY, add_image
 from maplab_py.progress import SILENT, Progress
-from maplab_py.sensors import Camera, Distortion, Projection
-from maplab_py.sensors.projection import back_project, project
+from maplab_py.sensors import Camera, Distortion, Projection, projection
 from maplab_py.storage.resources.new import NewResources
 from maplab_py.storage.resources.types import resource_type
 from maplab_py.vimap import ResourceOwner, VIMap, from_hex, mission_labels, mission_time_spans_ns
@@ -119,8 +117,8 @@ def largest_distance_px(first: Camera, second: Camera) -> float:
     u = np.linspace(0.0, first.width_px - 1.0, _GRID)
     v = np.linspace(0.0, first.height_px - 1.0, _GRID)
     uv = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-    rays, has_ray = back_project(first, uv)
-    seen, is_seen = project(second, rays)
+    rays, has_ray = projection.back_project(first, uv)
+    seen, is_seen = projection.project(second, rays)
     both = has_ray & is_seen
     if not both.any():
         return float("inf")
@@ -287,7 +285,7 @@ def _import_images(
         else:
             stamp_ns = int(topic.stamps_ns[number])
             data = recorded_images.image_of_message(message, name, camera)
-            add_image(new, CameraImage(0, stamp_ns, stamp_ns, data, bits), link=False)
+            add_image(new, protocol.CameraImage(0, stamp_ns, stamp_ns, data, bits), link=False)
     attached = new.attached(vi_map, np.arange(len(owners)), owners) if len(owners) else vi_map
     return attached, BagImport(
         mission=mission_labels(vi_map)[mission],
@@ -345,7 +343,7 @@ def _bits(topic: _Topic, camera: Camera, numbers: I64) -> int:
     images = []
     for _, message in topic.chosen(numbers[sampled(len(numbers))]):
         data = recorded_images.image_of_message(message, topic.name, camera)
-        images.append(CameraImage(0, 0, 0, data))
+        images.append(protocol.CameraImage(0, 0, 0, data))
         if data.bits:
             break
     return recorded_images.camera_bits(images)

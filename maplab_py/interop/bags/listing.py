@@ -4,8 +4,7 @@ import dataclasses
 from pathlib import Path
 
 from maplab_py.interop.bags.sensor_messages import COMPRESSED, IMAGE
-from maplab_py.interop.recordings.bag_files import all_messages, check_bag, opened_bag
-from maplab_py.interop.recordings.bag_writing import format_of_bag
+from maplab_py.interop.recordings import bag_files, bag_writing
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
 
@@ -69,13 +68,13 @@ def bag_info(path: Path, *, progress: Progress = SILENT) -> BagInfo:
         UserError: It is no bag, or the library is missing.
         MapError: It is damaged or has no index.
     """
-    check_bag(path, "--bag")
+    bag_files.check_bag(path, "--bag")
     topics: dict[tuple[str, str], _Times] = {}
-    with opened_bag(path) as reader:
+    with bag_files.opened_bag(path) as reader:
         for connection in reader.connections:
             topics[connection.topic, connection.msgtype] = _Times(connection.msgtype)
         total = reader.message_count
-        messages = all_messages(path, reader, list(reader.connections))
+        messages = bag_files.all_messages(path, reader, list(reader.connections))
         for done, (connection, time_ns, data) in enumerate(messages):
             if done % _PROGRESS_EVERY == 0:
                 progress.step(done, total, "messages")
@@ -89,7 +88,7 @@ def bag_info(path: Path, *, progress: Progress = SILENT) -> BagInfo:
     end_ns = max((times.last_ns for times in heard), default=0)
     return BagInfo(
         bag=path,
-        format=format_of_bag(path).value,
+        format=bag_writing.format_of_bag(path).value,
         start_ns=start_ns,
         duration_s=0.0 if start_ns is None else (end_ns - start_ns) * _NS_TO_S,
         messages=sum(times.count for times in heard),

@@ -10,8 +10,7 @@ from maplab_py.interop.bags.exporting import IMAGES, MessageStream, MissionStrea
 from maplab_py.interop.bags.options import BagExportOptions, BagReport, written_topics
 from maplab_py.interop.bags.sensor_messages import CLOUD, LINES, PATH, MessageMaker
 from maplab_py.interop.ply import PlyCloud
-from maplab_py.interop.recordings import bag_writing
-from maplab_py.interop.recordings.bag_layouts import pose_messages
+from maplab_py.interop.recordings import bag_layouts, bag_writing
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import LandmarkQuality, VIMap, mission_labels
 
@@ -100,7 +99,7 @@ def _mission(
     if not len(times_ns):
         return []
     name = "".join(letter if letter.isalnum() else "_" for letter in label)
-    poses = pose_messages(times_ns, T_G_I, _FRAME, is_ros_2=True)
+    poses = bag_layouts.pose_messages(times_ns, T_G_I, _FRAME, is_ros_2=True)
     topic = f"/mission_{name}/pose"
     path = maker.path(times_ns, T_G_I, _FRAME)
     return [

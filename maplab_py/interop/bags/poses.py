@@ -11,9 +11,7 @@ from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
 from maplab_py.interop.bags.options import BagReport, PoseToBagOptions, written_topics
-from maplab_py.interop.recordings import bag_writing
-from maplab_py.interop.recordings.bag_files import check_bag, opened_bag
-from maplab_py.interop.recordings.bag_layouts import tf_messages, transform_messages
+from maplab_py.interop.recordings import bag_files, bag_layouts, bag_writing
 from maplab_py.interop.vertex_states import poses_at
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap, mission_labels, mission_time_spans_ns
@@ -68,7 +66,7 @@ def add_poses_to_bag(
         MapError: The source is damaged.
     """
     options = options or PoseToBagOptions()
-    check_bag(source, "--rosbag_plugin_input_bag")
+    bag_files.check_bag(source, "--rosbag_plugin_input_bag")
     if target.exists() and target.resolve() == source.resolve():
         raise UserError(f"--rosbag_plugin_output_bag={target} is the input: name another bag")
     kind = bag_writing.format_of_bag(source)
@@ -78,7 +76,7 @@ def add_poses_to_bag(
     if not poses:
         raise UserError("the missions have no vertices: there are no poses to add")
     dropped = (TF_TOPIC,) if options.drop_tf else ()
-    with opened_bag(source) as reader:
+    with bag_files.opened_bag(source) as reader:
         present = {(c.topic, c.msgtype): bag_writing.channel_of(c) for c in reader.connections}
         _check_types(source, present, poses, options, kind)
         added = [_added(entry, options, kind, present) for entry in poses]
@@ -155,11 +153,11 @@ def _added(
             ("T_M_I", T_M_I, (odom, base)),
             ("T_G_M", T_G_M, (world, odom)),
         ):
-            rows = transform_messages(poses.times_ns, T, frames, is_ros_2=kind.is_ros_2)
+            rows = bag_layouts.transform_messages(poses.times_ns, T, frames, is_ros_2=kind.is_ros_2)
             streams.append((f"/{name}{poses.suffix}", _TRANSFORM_TYPE, rows))
     if options.add_tf:
         tree = [(T_G_M, (world, odom)), (T_M_I, (odom, base))]
-        rows = tf_messages(poses.times_ns, tree, is_ros_2=kind.is_ros_2)
+        rows = bag_layouts.tf_messages(poses.times_ns, tree, is_ros_2=kind.is_ros_2)
         streams.append((TF_TOPIC, TF_TYPE, rows))
     times = poses.times_ns.tolist()
     return [

@@ -9,11 +9,9 @@ import numpy as np
 from maplab_py.array_types import F64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3
-from maplab_py.interop.calibrations.kalibr import with_measurement_matrices
-from maplab_py.interop.calibrations.models import make_camera
+from maplab_py.interop.calibrations import kalibr, models
 from maplab_py.interop.calibrations.parts import Parts, note_unknown_keys
-from maplab_py.sensors import Camera, Imu
-from maplab_py.sensors.yaml_entry import Entry
+from maplab_py.sensors import Camera, Imu, yaml_entry
 
 _UNIT_TOLERANCE = 1e-3
 _MAX_TIME_OFFSET_NS = 10_000_000_000
@@ -37,7 +35,7 @@ _TERMS = {
 """Projection, distortion, and the names of their parameters by Basalt's names of models."""
 
 
-def read_basalt(top: Entry) -> Parts:
+def read_basalt(top: yaml_entry.Entry) -> Parts:
     """Read a calibration of Basalt; biases, the vignette and poses of markers are not used.
 
     Raises:
@@ -69,7 +67,7 @@ def read_basalt(top: Entry) -> Parts:
     return Parts("Basalt", cameras, T_i_C, imu, se3.inverse(T_I_i), notes=notes)
 
 
-def _pose(entry: Entry) -> F64:
+def _pose(entry: yaml_entry.Entry) -> F64:
     """Return the pose (7,) of keys qx ... pz."""
     values = np.array([entry.number(key) for key in ("qx", "qy", "qz", "qw", "px", "py", "pz")])
     norm = float(np.linalg.norm(values[:4]))
@@ -78,7 +76,7 @@ def _pose(entry: Entry) -> F64:
     return np.concatenate([values[:4] / norm, values[4:]])
 
 
-def _camera(entry: Entry, width_px: int, height_px: int, offset_ns: int) -> Camera:
+def _camera(entry: yaml_entry.Entry, width_px: int, height_px: int, offset_ns: int) -> Camera:
     name = entry.text("camera_type")
     if name not in _TERMS:
         raise MapError(
@@ -97,7 +95,7 @@ def _camera(entry: Entry, width_px: int, height_px: int, offset_ns: int) -> Came
             raise MapError(f"{values.where}: key 'alpha' must be from 0 to 1, 1 excluded")
         mirror, focal = [alpha / (1.0 - alpha)], focal / (1.0 - alpha)
     coefficients = [values.number(key, None if row < 4 else 0.0) for row, key in enumerate(names)]
-    return make_camera(
+    return models.make_camera(
         values,
         ("camera_type", projection),
         ("camera_type", distortion),
@@ -108,7 +106,7 @@ def _camera(entry: Entry, width_px: int, height_px: int, offset_ns: int) -> Came
     )
 
 
-def _imu(entry: Entry) -> tuple[Imu, F64]:
+def _imu(entry: yaml_entry.Entry) -> tuple[Imu, F64]:
     """Return the IMU and T_I_i (7,)."""
     imu = Imu(
         id="",
@@ -123,10 +121,10 @@ def _imu(entry: Entry) -> tuple[Imu, F64]:
     if min(np.linalg.det(matrix) for matrix in corrections) <= 0.0:
         raise MapError(f"{entry.where}: scale and misalignment of the IMU are no proper matrices")
     A, W = (np.linalg.inv(matrix) for matrix in corrections)
-    return with_measurement_matrices(imu, W, A)
+    return kalibr.with_measurement_matrices(imu, W, A)
 
 
-def _noise(entry: Entry, key: str) -> float:
+def _noise(entry: yaml_entry.Entry, key: str) -> float:
     """Return the largest noise density of the three axes; old files have one number."""
     value = entry.raw(key)
     count = len(value) if isinstance(value, list) else 0

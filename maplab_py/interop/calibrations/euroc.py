@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from maplab_py.errors import MapError
-from maplab_py.interop.calibrations import models
-from maplab_py.interop.calibrations.kalibr import read_camera_chain, read_kalibr_imu
+from maplab_py.interop.calibrations import kalibr, models
 from maplab_py.interop.calibrations.parts import Parts, note_unknown_keys, read_entry, with_imu
 from maplab_py.sensors.yaml_entry import Entry
 
@@ -96,13 +95,13 @@ def read_folder(folder: Path) -> Parts:
     chain = folder.parent / "dso" / "camchain.yaml"
     if not chain.exists():
         raise MapError(f"{folder}: there is no calibration (cam0/sensor.yaml): {HOW_TO_CALIBRATE}")
-    cameras = read_camera_chain(read_entry(chain))
+    cameras = kalibr.read_camera_chain(read_entry(chain))
     imu_file = chain.with_name("imu_config.yaml")
     if not imu_file.exists():
         return cameras
     if cameras.why_not_on_imu:
         raise MapError(cameras.why_not_on_imu)
-    return with_imu(cameras, read_kalibr_imu(read_entry(imu_file)))
+    return with_imu(cameras, kalibr.read_kalibr_imu(read_entry(imu_file)))
 
 
 def _read_sensor_files(folder: Path) -> Parts:

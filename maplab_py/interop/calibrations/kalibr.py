@@ -15,8 +15,7 @@ from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.calibrations import models
 from maplab_py.interop.calibrations.parts import Parts, compare_poses, note_unknown_keys
-from maplab_py.sensors import Camera, Imu, ImuIntrinsics
-from maplab_py.sensors.yaml_entry import Entry
+from maplab_py.sensors import Camera, Imu, ImuIntrinsics, yaml_entry
 
 _IDENTITY_TOLERANCE = 1e-9
 _NOT_OF_THE_CALIBRATION = ("cam_overlaps", "update_rate", "T_i_b", "overlaps", "rosbag")
@@ -26,12 +25,12 @@ _NO_IMU_POSE = (
 )
 
 
-def is_camera_chain(entry: Entry) -> bool:
+def is_camera_chain(entry: yaml_entry.Entry) -> bool:
     """Tell whether a calibration file is kalibr's camera chain."""
     return any(_camera_number(key) is not None for key in entry)
 
 
-def read_camera_chain(entry: Entry, form: str = "kalibr") -> Parts:
+def read_camera_chain(entry: yaml_entry.Entry, form: str = "kalibr") -> Parts:
     """Return the cameras of a chain, on the IMU where the chain has their poses on it.
 
     Raises:
@@ -76,7 +75,7 @@ def _camera_number(key: object) -> int | None:
     return int(digits) if is_camera and digits.isascii() else None
 
 
-def _given_poses(entry: Entry, before: list[F64]) -> list[tuple[str, F64]]:
+def _given_poses(entry: yaml_entry.Entry, before: list[F64]) -> list[tuple[str, F64]]:
     """Return all poses T_cam_B (7,) that a camera has, by key, the one that counts first."""
     given = []
     if "T_cam_imu" in entry:
@@ -90,7 +89,7 @@ def _given_poses(entry: Entry, before: list[F64]) -> list[tuple[str, F64]]:
     return given
 
 
-def _compare_pairs(entry: Entry, T_cam_B: F64) -> list[str]:
+def _compare_pairs(entry: yaml_entry.Entry, T_cam_B: F64) -> list[str]:
     """Return notes where T_cam1_cam0 contradicts the poses of the cameras."""
     notes = []
     for key in entry:
@@ -105,7 +104,7 @@ def _compare_pairs(entry: Entry, T_cam_B: F64) -> list[str]:
     return notes
 
 
-def read_kalibr_imu(top: Entry, form: str = "kalibr") -> Parts:
+def read_kalibr_imu(top: yaml_entry.Entry, form: str = "kalibr") -> Parts:
     """Return the IMU of kalibr's or OpenVINS' IMU file; B is the frame i that cameras refer to.
 
     Raises:
@@ -140,7 +139,7 @@ def with_measurement_matrices(imu: Imu, W: F64, A: F64) -> tuple[Imu, F64]:
     return dataclasses.replace(imu, intrinsics=ImuIntrinsics(T_g, T_a, R_A_I)), T_I_i
 
 
-def _measurement_matrices(entry: Entry) -> tuple[F64, F64]:
+def _measurement_matrices(entry: yaml_entry.Entry) -> tuple[F64, F64]:
     """Return W and A (3, 3), after the model of the entry."""
     model = entry.text("model", default="calibrated")
     if "gyroscopes" in entry or "accelerometers" in entry or model.startswith("scale-mis"):
@@ -174,11 +173,11 @@ def upper_triangular_and_rotation(matrix: F64) -> tuple[F64, F64]:
     return np.triu(T * signs), R * signs[:, None]
 
 
-def _matrix_or_identity(entry: Entry, key: str) -> F64:
+def _matrix_or_identity(entry: yaml_entry.Entry, key: str) -> F64:
     return entry.matrix(key, 3, 3) if key in entry else np.eye(3)
 
 
-def _refuse_sensitivity(entry: Entry, key: str) -> None:
+def _refuse_sensitivity(entry: yaml_entry.Entry, key: str) -> None:
     if key in entry and np.any(entry.matrix(key, 3, 3) != 0.0):
         raise MapError(
             f"{entry.where}: key '{key}': the gyroscope's sensitivity to acceleration is not "
@@ -186,7 +185,7 @@ def _refuse_sensitivity(entry: Entry, key: str) -> None:
         )
 
 
-def _invertible(matrix: F64, entry: Entry) -> F64:
+def _invertible(matrix: F64, entry: yaml_entry.Entry) -> F64:
     if np.linalg.det(matrix) <= 0.0:
         raise MapError(
             f"{entry.where}: scale and misalignment do not form a valid matrix: the determinant must be "

@@ -12,20 +12,19 @@ import numpy as np
 from maplab_py.errors import MapError
 from maplab_py.interop.calibrations import models
 from maplab_py.interop.calibrations.parts import Parts, note_unknown_keys
-from maplab_py.sensors import Camera
-from maplab_py.sensors.yaml_entry import Entry
+from maplab_py.sensors import Camera, yaml_entry
 
 _OKVIS_NOISE = ("sigma_a_c", "sigma_aw_c", "sigma_g_c", "sigma_gw_c")
 _SVO_NOISE = ("sigma_acc_c", "sigma_acc_bias_c", "sigma_omega_c", "sigma_omega_bias_c")
 _SVO_DISTORTIONS = {"fisheye": "fov"}  # vikit's fisheye is the model of one field of view
 
 
-def is_okvis(entry: Entry) -> bool:
+def is_okvis(entry: yaml_entry.Entry) -> bool:
     """Tell whether a file has settings of OKVIS."""
     return any("T_SC" in camera for camera in _first_camera(entry))
 
 
-def is_svo(entry: Entry) -> bool:
+def is_svo(entry: yaml_entry.Entry) -> bool:
     """Tell whether a file has cameras of SVO: those of maplab have ids."""
     if "cam_model" in entry and "cam_width" in entry:
         return True
@@ -36,13 +35,13 @@ def is_svo(entry: Entry) -> bool:
     )
 
 
-def _first_camera(entry: Entry) -> Sequence[Entry]:
+def _first_camera(entry: yaml_entry.Entry) -> Sequence[yaml_entry.Entry]:
     cameras = entry.raw("cameras") if "cameras" in entry else None
     is_list = isinstance(cameras, list) and cameras and isinstance(cameras[0], dict)
-    return [Entry(cameras[0], entry.where)] if is_list and cameras else []
+    return [yaml_entry.Entry(cameras[0], entry.where)] if is_list and cameras else []
 
 
-def read_okvis(entry: Entry) -> Parts:
+def read_okvis(entry: yaml_entry.Entry) -> Parts:
     """Return cameras and IMU.
 
     Raises:
@@ -82,7 +81,7 @@ def _limits(accel_key: str, gyro_key: str) -> dict[str, str]:
     }
 
 
-def read_svo(entry: Entry) -> Parts:
+def read_svo(entry: yaml_entry.Entry) -> Parts:
     """Return cameras and IMU.
 
     Raises:
@@ -121,7 +120,7 @@ def read_svo(entry: Entry) -> Parts:
     return Parts("SVO", cameras, np.stack(poses), imu, notes=notes)
 
 
-def _old_svo_camera(entry: Entry) -> Camera:
+def _old_svo_camera(entry: yaml_entry.Entry) -> Camera:
     """Return the camera of SVO 1's file; the ATAN model is relative to the size of the image."""
     model = entry.text("cam_model")
     size = np.array([entry.integer("cam_width"), entry.integer("cam_height")], dtype=np.float64)

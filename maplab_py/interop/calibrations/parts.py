@@ -13,9 +13,7 @@ from maplab_py.array_types import F64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3
 from maplab_py.input_files import read_foreign_text
-from maplab_py.sensors import Camera, Imu
-from maplab_py.sensors.yaml_entry import Entry
-from maplab_py.sensors.yaml_text import parse_yaml
+from maplab_py.sensors import Camera, Imu, yaml_entry, yaml_text
 
 _MAX_BYTES = 16_000_000
 _OPENCV_HEAD = re.compile(r"\A\s*%YAML[: ]1\.\d.*\n?")
@@ -56,7 +54,7 @@ def is_json(path: Path) -> bool:
     return read_calibration_text(path).lstrip().startswith("{")
 
 
-def read_entry(path: Path) -> Entry:
+def read_entry(path: Path) -> yaml_entry.Entry:
     """Read a YAML file of key-value pairs; OpenCV's first line and its matrices are accepted.
 
     Raises:
@@ -65,10 +63,10 @@ def read_entry(path: Path) -> Entry:
     text = _OPENCV_TAG.sub("", _OPENCV_HEAD.sub("", read_calibration_text(path)))
     documents = [part for part in _DOCUMENT_END.split(text) if part.strip()]
     text = next((part for part in documents if _CONTENT.search(part)), "")  # messages repeat
-    return Entry(parse_yaml(text, str(path), _MAX_BYTES * 10), str(path))
+    return yaml_entry.Entry(yaml_text.parse_yaml(text, str(path), _MAX_BYTES * 10), str(path))
 
 
-def read_json_entry(path: Path) -> Entry:
+def read_json_entry(path: Path) -> yaml_entry.Entry:
     """Read a JSON file of key-value pairs.
 
     Raises:
@@ -78,7 +76,7 @@ def read_json_entry(path: Path) -> Entry:
         value: Any = json.loads(read_calibration_text(path))
     except (ValueError, RecursionError) as error:
         raise MapError(f"{path}: not valid JSON: {error}") from error
-    return Entry(value, str(path))
+    return yaml_entry.Entry(value, str(path))
 
 
 def compare_poses(where: str, named: Sequence[tuple[str, F64]]) -> list[str]:
@@ -98,7 +96,7 @@ def compare_poses(where: str, named: Sequence[tuple[str, F64]]) -> list[str]:
 
 
 def note_unknown_keys(
-    entry: Entry, ignored: Sequence[str] = (), *, settings: bool = False
+    entry: yaml_entry.Entry, ignored: Sequence[str] = (), *, settings: bool = False
 ) -> list[str]:
     """Return one note that names the keys which were not understood, none if there are none.
 

@@ -11,8 +11,7 @@ from maplab_py.errors import MapError
 from maplab_py.geometry import se3
 from maplab_py.interop.calibrations.models import make_camera, read_time_shift_ns
 from maplab_py.interop.calibrations.parts import Parts, note_unknown_keys, read_calibration_text
-from maplab_py.sensors import Camera
-from maplab_py.sensors.yaml_entry import Entry
+from maplab_py.sensors import Camera, yaml_entry
 
 _ON_CAMERA: F64 = np.eye(1, 7, 3)
 _MATRICES = ("camera_matrix", "Camera_Matrix", "K", "k")
@@ -33,14 +32,14 @@ _DSO_MODELS = {
 _DSO_FIRST = re.compile(r"\s*(?:[A-Za-z]+\s+)?(?:[-+0-9.eE]+\s+){4}[-+0-9.eE]+")
 
 
-def is_camera_info(entry: Entry) -> bool:
+def is_camera_info(entry: yaml_entry.Entry) -> bool:
     """Tell whether a file is ROS' CameraInfo, or of OpenCV's calibration."""
     return any(key in entry for key in _MATRICES) and any(
         key in entry for key in ("image_width", "width")
     )
 
 
-def read_camera_info(entry: Entry) -> Parts:
+def read_camera_info(entry: yaml_entry.Entry) -> Parts:
     """Return the camera; `distortion_model` is OpenCV's polynomial where the file does not say.
 
     Raises:
@@ -84,7 +83,7 @@ def read_dso_camera(path: Path) -> Parts:
     return Parts("DM-VIO", [dso_camera(path)], _ON_CAMERA, why_not_on_imu=why)
 
 
-def read_dm_vio(entry: Entry, path: Path) -> Parts:
+def read_dm_vio(entry: yaml_entry.Entry, path: Path) -> Parts:
     """Return the camera of a camchain.yaml that has its pose alone; camera*.txt beside it has the rest.
 
     Raises:
@@ -135,7 +134,7 @@ def dso_camera(path: Path) -> Camera:
     terms = values[4 : 4 + count]
     if distortion == "none" and np.any(values[4:]):
         raise MapError(f"{path}:1: a pinhole camera has no distortion parameters")
-    entry = Entry({}, str(path))
+    entry = yaml_entry.Entry({}, str(path))
     return make_camera(entry, ("model", "pinhole"), ("model", distortion), pinhole, terms, size)
 
 

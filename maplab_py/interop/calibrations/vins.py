@@ -14,8 +14,7 @@ from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.calibrations import models
 from maplab_py.interop.calibrations.parts import Parts, note_unknown_keys, read_entry
-from maplab_py.sensors import Camera, Imu
-from maplab_py.sensors.yaml_entry import Entry
+from maplab_py.sensors import Camera, Imu, yaml_entry
 
 _MAX_CAMERAS = 16
 _NOISE = (
@@ -30,13 +29,13 @@ _MODELS = {
 """Projection, distortion, and names of the parameters by camodocal's names of models."""
 
 
-def is_vins(entry: Entry) -> bool:
+def is_vins(entry: yaml_entry.Entry) -> bool:
     """Tell whether a file has settings of VINS, or one of its cameras."""
     keys = ("body_T_cam0", "cam0_calib", "extrinsicRotation", "projection_parameters")
     return any(key in entry for key in keys) or ("acc_n" in entry and "gyr_n" in entry)
 
 
-def read_vins(entry: Entry, folder: Path) -> Parts:
+def read_vins(entry: yaml_entry.Entry, folder: Path) -> Parts:
     """Return cameras and IMU of the settings.
 
     Args:
@@ -82,7 +81,7 @@ def read_vins(entry: Entry, folder: Path) -> Parts:
     return Parts("VINS", cameras, T_B_C, imu, why_not_on_imu=why, notes=notes)
 
 
-def _camera(entry: Entry) -> Camera:
+def _camera(entry: yaml_entry.Entry) -> Camera:
     name = entry.text("model_type").upper()
     if name not in _MODELS:
         raise MapError(
@@ -105,11 +104,11 @@ def _camera(entry: Entry) -> Camera:
     )
 
 
-def _pose(entry: Entry, key: str) -> F64 | None:
+def _pose(entry: yaml_entry.Entry, key: str) -> F64 | None:
     return entry.pose(key) if key in entry else None
 
 
-def _mono_pose(entry: Entry) -> F64 | None:
+def _mono_pose(entry: yaml_entry.Entry) -> F64 | None:
     """Return the pose of VINS-Mono's camera on the IMU, None if VINS estimates it from nothing."""
     if "body_T_cam0" in entry:
         return entry.pose("body_T_cam0")
@@ -119,19 +118,19 @@ def _mono_pose(entry: Entry) -> F64 | None:
     return se3.make(so3.from_matrix(R), entry.vector("extrinsicTranslation", 3))
 
 
-def _line_delay_ns(entry: Entry, camera: Camera) -> int:
+def _line_delay_ns(entry: yaml_entry.Entry, camera: Camera) -> int:
     readout_ns = models.read_time_shift_ns(entry, "rolling_shutter_tr")
     return round(readout_ns / camera.height_px) if entry.integer("rolling_shutter", 0) else 0
 
 
-def _imu(entry: Entry) -> Imu | None:
+def _imu(entry: yaml_entry.Entry) -> Imu | None:
     if not entry.integer("imu", int("acc_n" in entry)):
         return None
     noise, limits = ("acc_n", "acc_w", "gyr_n", "gyr_w"), {"gravity_magnitude_mps2": "g_norm"}
     return models.read_imu(entry, noise, limits, topic=entry.text("imu_topic"))
 
 
-def _compare_sizes(entry: Entry, cameras: list[Camera]) -> list[str]:
+def _compare_sizes(entry: yaml_entry.Entry, cameras: list[Camera]) -> list[str]:
     """Return a note where the settings say another size of images than a camera."""
     if "image_width" not in entry or "image_height" not in entry:
         return []

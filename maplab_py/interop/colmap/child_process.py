@@ -6,8 +6,7 @@ from pathlib import Path
 from maplab_py.cancellation import check_cancelled, cleaned_up
 from maplab_py.child_processes import Service, ServiceEnded, processors
 from maplab_py.errors import MapError
-from maplab_py.interop.colmap.binary import binary_files
-from maplab_py.interop.colmap.child import BINARY
+from maplab_py.interop.colmap import binary, child
 from maplab_py.interop.colmap.model import ColmapModel
 
 logger = logging.getLogger(__name__)
@@ -22,9 +21,9 @@ _FAILURES = {
 
 def write_job_model(model: ColmapModel, folder: Path) -> None:
     """Write a model for a job: the folder `binary` below the job's folder, which is temporary."""
-    (folder / BINARY).mkdir()
-    for name, content in binary_files(model).items():
-        with (folder / BINARY / name).open("wb") as stream:
+    (folder / child.BINARY).mkdir()
+    for name, content in binary.binary_files(model).items():
+        with (folder / child.BINARY / name).open("wb") as stream:
             stream.writelines(content)
 
 

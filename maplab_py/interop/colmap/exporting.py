@@ -15,16 +15,12 @@ from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.distinct import distinct
 from maplab_py.errors import FlagError, UserError
 from maplab_py.geometry import se3
+from maplab_py.interop.colmap import binary, child, child_process, undistortion
 from maplab_py.interop.colmap import model as colmap
-from maplab_py.interop.colmap.binary import binary_files
-from maplab_py.interop.colmap.child import TEXT
-from maplab_py.interop.colmap.child_process import run_job, write_job_model
 from maplab_py.interop.colmap.options import ColmapExportOptions, ColmapExportReport
-from maplab_py.interop.colmap.undistortion import undistorted
 from maplab_py.output_files import check_writable, write_bytes
-from maplab_py.sensors import Camera
-from maplab_py.sensors.projection import project
-from maplab_py.vimap import LandmarkQuality, MissionSensor, VIMap, from_hex, is_valid
+from maplab_py.sensors import Camera, projection
+from maplab_py.vimap import LandmarkQuality, MissionSensor, VIMap, edits, from_hex, is_valid
 from maplab_py.vimap.descriptors import (
     DescriptorDepth,
     FeatureType,
@@ -32,7 +28,6 @@ from maplab_py.vimap.descriptors import (
     type_of_name,
     types_of,
 )
-from maplab_py.vimap.edits import remove_keypoints
 from maplab_py.vimap.queries import is_metric, mission_labels, mission_sensor_id
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
 
@@ -62,20 +57,20 @@ def export_colmap(
     if options.colmap_feature_type:
         vi_map = _of_type(vi_map, options.colmap_feature_type)
     if options.undistort:
-        vi_map, lost = undistorted(vi_map, rows)
+        vi_map, lost = undistortion.undistorted(vi_map, rows)
     exported = model_of_map(vi_map, rows, quality=options.quality)
     model = exported.model
     with tempfile.TemporaryDirectory(prefix="maplab-colmap-") as name:
         work = Path(name)
         if options.colmap_format == "text" or options.colmap_database:
-            write_job_model(model, work)
+            child_process.write_job_model(model, work)
         if options.colmap_format == "text":
-            run_job("write_text", work, folder)
+            child_process.run_job("write_text", work, folder)
             for kind in colmap.FILES:
                 path = folder / f"{kind}.txt"
-                write_bytes(path, _chunks(work / TEXT / path.name), overwrite=overwrite)
+                write_bytes(path, _chunks(work / child.TEXT / path.name), overwrite=overwrite)
         else:
-            for file, content in binary_files(model).items():
+            for file, content in binary.binary_files(model).items():
                 write_bytes(folder / file, content, overwrite=overwrite)
         write_bytes(folder / colmap.FILE_NAME, [exported.side_file.content()], overwrite=overwrite)
         if options.colmap_database:
@@ -110,7 +105,7 @@ def _of_type(vi_map: VIMap, name: str) -> VIMap:
         raise UserError(
             f"--colmap_feature_type={name}: the map has no such keypoints; its types: {types}"
         )
-    return remove_keypoints(vi_map, other)
+    return edits.remove_keypoints(vi_map, other)
 
 
 def _check_folder(
@@ -149,7 +144,7 @@ def _write_database(
     if options.colmap_pose_priors:
         arrays["priors"] = np.ones(1)
     np.savez(work / "database.npz", **arrays)
-    run_job("database", work, folder / DATABASE)
+    child_process.run_job("database", work, folder / DATABASE)
     write_bytes(folder / DATABASE, _chunks(work / DATABASE), overwrite=overwrite)
 
 
@@ -416,7 +411,7 @@ def _errors(
     cameras = [camera for rig in rigs for camera in rig.cameras]
     for row, camera in enumerate(cameras):
         mine = np.flatnonzero(camera_row[image] == row)
-        uv, seen[mine] = project(camera, p_C[mine])
+        uv, seen[mine] = projection.project(camera, p_C[mine])
         error[mine] = np.linalg.norm(uv + colmap.PIXEL_CENTRE - images.uv[observing[mine]], axis=1)
     place = np.searchsorted(landmarks, landmark[seen])
     count = np.bincount(place, minlength=len(landmarks))

@@ -13,9 +13,8 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import MapError, UserError
-from maplab_py.geometry import se3, so3
+from maplab_py.geometry import interpolation, se3, so3
 from maplab_py.geometry.alignment import apply_similarity, umeyama
-from maplab_py.geometry.interpolation import interpolate_poses
 from maplab_py.input_files import read_foreign_text
 from maplab_py.interop.colmap.child_process import run_job, write_job_model
 from maplab_py.interop.colmap.features import with_features, with_images
@@ -348,7 +347,7 @@ def place_by_trajectory(times_ns: I64, T_W_R: F64, T_R_I: F64, trajectory: Traje
         UserError: Fewer than three vertices have a pose in the trajectory.
     """
     stamps, first = np.unique(trajectory.times_ns, return_index=True)
-    T_G_I, valid = interpolate_poses(
+    T_G_I, valid = interpolation.interpolate_poses(
         stamps, trajectory.T_R_B[first], times_ns, max_gap_ns=_LONGEST_GAP_NS
     )
     if np.count_nonzero(valid) < _MIN_MATCHED:

@@ -7,8 +7,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64, U64, Mask
 from maplab_py.errors import MapError, UserError
-from maplab_py.geometry import se3
-from maplab_py.geometry.alignment import apply_similarity
+from maplab_py.geometry import alignment, se3
 from maplab_py.interop.colmap.model import (
     PIXEL_CENTRE,
     ColmapModel,
@@ -17,8 +16,7 @@ from maplab_py.interop.colmap.model import (
     SideFile,
     map_camera,
 )
-from maplab_py.sensors import CameraRig, SensorSet
-from maplab_py.sensors.sensor_set import Extrinsics, OtherSensor
+from maplab_py.sensors import CameraRig, SensorSet, sensor_set
 from maplab_py.vimap import MissionSensor, VIMap, from_hex, ragged_rows, random_ids, tables, to_hex
 from maplab_py.vimap.descriptors import no_blocks
 from maplab_py.vimap.queries import ARBITRARY_SCALE
@@ -136,7 +134,7 @@ def map_of_model(
         UserError: maplab lacks a camera model.
     """
     rng = np.random.default_rng(_seed(model, times_ns))
-    T_G_I = se3.compose(apply_similarity(T_G_W, scale, bodies.T_W_R), bodies.T_R_I)
+    T_G_I = se3.compose(alignment.apply_similarity(T_G_W, scale, bodies.T_W_R), bodies.T_R_I)
     sensors, sensor_id = _sensors(model, bodies, side, scale, is_metric, rng)
     frames, images = _frames(model, bodies, times_ns, side, rng)
     keypoints = ragged_rows(model.images.keypoint_start, images)
@@ -196,8 +194,8 @@ def _sensors(
         camera_id = _restored(camera_id, rows, side.camera_id)
         rows = _rows_of(side.rig, np.array([rig.id for rig in model.rigs]))
         rig_id = _restored(rig_id, rows, side.rig_id)
-    sensors: dict[str, CameraRig | OtherSensor] = {}
-    extrinsics: dict[str, Extrinsics] = {}
+    sensors: dict[str, CameraRig | sensor_set.OtherSensor] = {}
+    extrinsics: dict[str, sensor_set.Extrinsics] = {}
     sensor_id = np.zeros((len(bodies.mission_rig), len(MissionSensor), 2), dtype=np.uint64)
     odometry_ids = random_ids(len(bodies.mission_rig), rng)
     for mission, row in enumerate(bodies.mission_rig.tolist()):
@@ -210,12 +208,12 @@ def _sensors(
         )
         T_I_C = se3.compose(bodies.T_I_R[row], se3.inverse(T_C_R))
         sensors[name] = CameraRig(name, cameras, T_I_C)
-        extrinsics[name] = Extrinsics(name, se3.identity())
+        extrinsics[name] = sensor_set.Extrinsics(name, se3.identity())
         odometry = to_hex(odometry_ids[mission])
         keys = {"id": odometry, "sensor_type": "ODOMETRY_6DOF", "topic": "colmap"}
         marks = {} if is_metric[mission] else {ARBITRARY_SCALE: True}
-        sensors[odometry] = OtherSensor(odometry, "ODOMETRY_6DOF", {**keys, **marks})
-        extrinsics[odometry] = Extrinsics(name, se3.identity())
+        sensors[odometry] = sensor_set.OtherSensor(odometry, "ODOMETRY_6DOF", {**keys, **marks})
+        extrinsics[odometry] = sensor_set.Extrinsics(name, se3.identity())
         sensor_id[mission, MissionSensor.NCAMERA] = from_hex(name)
         sensor_id[mission, MissionSensor.ODOMETRY_6DOF] = from_hex(odometry)
     return SensorSet(sensors, extrinsics), sensor_id

@@ -8,9 +8,8 @@ import numpy as np
 
 from maplab_py.array_types import I64
 from maplab_py.interop.colmap.model import NO_POINT, ColmapCamera, ColmapModel, has_model
-from maplab_py.sensors import Camera, CameraRig, SensorSet
+from maplab_py.sensors import Camera, CameraRig, SensorSet, projection
 from maplab_py.sensors.camera import Distortion, Projection
-from maplab_py.sensors.projection import back_project
 from maplab_py.vimap import MissionSensor, VIMap, mission_sensor_id, ragged_rows, starts_of_counts
 
 _PINHOLE = 1
@@ -93,7 +92,7 @@ def undistorted(vi_map: VIMap, missions: I64) -> tuple[VIMap, int]:
         sensors[rig_id] = dataclasses.replace(rig, cameras=cameras)
         for index, (camera, new) in enumerate(zip(rig.cameras, cameras, strict=True)):
             mine = np.flatnonzero(np.isin(mission, rows) & (camera_index == index))
-            ray, valid = back_project(camera, uv[mine])
+            ray, valid = projection.back_project(camera, uv[mine])
             seen = valid & (ray[:, 2] > _MIN_Z)
             z = np.where(seen, ray[:, 2], 1.0)
             pixels = new.intrinsics[:2] * ray[:, :2] / z[:, None] + new.intrinsics[2:]

@@ -18,8 +18,7 @@ from maplab_py.interop.live.transport import (
     topic_of,
     wait_for_topics,
 )
-from maplab_py.interop.recordings import bag_writing
-from maplab_py.interop.recordings.bag_files import message_types
+from maplab_py.interop.recordings import bag_files, bag_writing
 from maplab_py.options import Options, option
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report, counted
@@ -123,7 +122,7 @@ def _topics(transport: Transport, names: list[str], wait_s: float) -> list[Topic
     Raises:
         UserError: One is not published, or has no standard type; or there is none.
     """
-    known = message_types(is_ros_2=transport.is_ros_2).fielddefs
+    known = bag_files.message_types(is_ros_2=transport.is_ros_2).fielddefs
     if names:
         topics = wait_for_topics(transport, names, wait_s)
         for topic in topics:

@@ -9,8 +9,7 @@ from maplab_py.interop.bags.sensor_messages import IMAGE, MessageMaker
 from maplab_py.interop.live.connection import open_transport
 from maplab_py.interop.live.options import NetworkOptions
 from maplab_py.interop.live.transport import LOOK_EVERY_S, Publish, Transport
-from maplab_py.interop.recordings.bag_layouts import imu_messages
-from maplab_py.interop.recordings.bags import IMU_TYPE
+from maplab_py.interop.recordings import bag_layouts, bags
 from maplab_py.interop.recordings.protocol import CameraImage, ImuBatch, Recording
 from maplab_py.options import Options, option
 from maplab_py.progress import SILENT, Progress
@@ -105,7 +104,7 @@ class _Player:
                 f"{recording.name}: two sensors have the same topic: name others in sensors.yaml"
             )
         self._publishers: dict[int, Publish] = {
-            sensor: transport.advertise(topic, IMU_TYPE if sensor < 0 else IMAGE)
+            sensor: transport.advertise(topic, bags.IMU_TYPE if sensor < 0 else IMAGE)
             for sensor, topic in self._topics.items()
         }
         self._sent = dict.fromkeys(self._topics, 0)
@@ -157,7 +156,7 @@ class _Player:
             tuple(
                 PlayedTopic(
                     topic,
-                    IMU_TYPE if row < 0 else IMAGE,
+                    bags.IMU_TYPE if row < 0 else IMAGE,
                     self._sent[row],
                     self._listeners[row],
                 )
@@ -181,7 +180,7 @@ class _Player:
     def _samples(self, batch: ImuBatch) -> Iterator[tuple[int, int, Callable[[], bytes]]]:
         stamps_ns = batch.times_ns + self._clock_offset_ns(batch.time_ns)
         is_ros_2 = self._transport.is_ros_2
-        rows = imu_messages(stamps_ns, batch.accel_gyro, "imu", is_ros_2=is_ros_2)
+        rows = bag_layouts.imu_messages(stamps_ns, batch.accel_gyro, "imu", is_ros_2=is_ros_2)
         for time_ns, row in zip(batch.times_ns.tolist(), rows, strict=True):
             yield time_ns, -1, lambda data=row: data  # type: ignore[misc]
 

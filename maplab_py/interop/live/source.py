@@ -18,12 +18,9 @@ from maplab_py.interop.images import Pixels, bits_of
 from maplab_py.interop.live import transport as transports
 from maplab_py.interop.live.options import LiveOptions
 from maplab_py.interop.live.receiving import Inbox, Message, TopicCounts
-from maplab_py.interop.recordings import protocol
-from maplab_py.interop.recordings.bag_files import imu_sample, message_types
-from maplab_py.interop.recordings.bags import IMAGE_TYPES, IMU_TYPE
+from maplab_py.interop.recordings import bag_files, bags, paired_imu, protocol
 from maplab_py.interop.recordings.images import image_of_message
 from maplab_py.interop.recordings.options import SourceOptions
-from maplab_py.interop.recordings.paired_imu import PairedImu, Sample
 from maplab_py.report import counted
 from maplab_py.sensors import Camera
 
@@ -105,8 +102,8 @@ class LiveRecording:
         self._offsets_ns = [camera.time_offset_ns for camera in device.cameras]
         self.inbox = Inbox(len(cameras), tolerance_ns, options.max_delay_s)
         self.counts = {topic.name: TopicCounts() for topic in topics}
-        self._store = message_types(is_ros_2=transport.is_ros_2)
-        self._paired = PairedImu() if len(self._imu_names) == 2 else None
+        self._store = bag_files.message_types(is_ros_2=transport.is_ros_2)
+        self._paired = paired_imu.PairedImu() if len(self._imu_names) == 2 else None
         self._arrivals: collections.OrderedDict[int, float] = collections.OrderedDict()
         self._latencies_ms: collections.deque[float] = collections.deque(maxlen=100_000)
         self._last_imu_ns, self._told = -1, 0
@@ -131,8 +128,8 @@ class LiveRecording:
 
     def _wanted_types(self) -> list[tuple[str, ...]]:
         return [
-            *((IMU_TYPE,) for _ in self._imu_names),
-            *(IMAGE_TYPES for _ in self.device.cameras),
+            *((bags.IMU_TYPE,) for _ in self._imu_names),
+            *(bags.IMAGE_TYPES for _ in self.device.cameras),
         ]
 
     # -- in the receiving thread ------------------------------------------------------------------
@@ -419,14 +416,14 @@ def _check_type(
 # Messages as they arrive: decoded with the functions that bags use, damage told as such.
 
 
-def imu_values(data: bytes, *, is_ros_2: bool) -> Sample:
+def imu_values(data: bytes, *, is_ros_2: bool) -> paired_imu.Sample:
     """Return [ax ay az gx gy gz] of a serialised sensor_msgs/Imu.
 
     Raises:
         MapError: The message is damaged, or a value is not a number.
     """
     try:
-        values = imu_sample(data, is_ros_2=is_ros_2)
+        values = bag_files.imu_sample(data, is_ros_2=is_ros_2)
     except (struct.error, IndexError) as error:
         raise MapError("the message is damaged") from error
     if not all(map(math.isfinite, values)):

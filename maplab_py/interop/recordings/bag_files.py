@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from maplab_py.errors import MapError, MaplabError, UserError
 from maplab_py.input_files import read_text
-from maplab_py.interop.recordings.bag_layouts import SQLITE
-from maplab_py.interop.recordings.clocks import Run
+from maplab_py.interop.recordings import bag_layouts, clocks
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -65,7 +64,7 @@ class TopicStream:
     delay_ns: int = 0  # from its time to its arrival
     arrivals_ns: tuple[int, int] | None = None  # of the part that is read
 
-    def of_run(self, run: Run) -> TopicStream:
+    def of_run(self, run: clocks.Run) -> TopicStream:
         """Return the stream that ends with a run of its clock."""
         return dataclasses.replace(
             self,
@@ -294,7 +293,7 @@ def _check_databases(path: Path) -> None:
     for file in files:
         with file.open("rb") as stream:
             header = stream.read(_SQLITE_HEADER)
-        if len(header) < _SQLITE_HEADER or not header.startswith(SQLITE):
+        if len(header) < _SQLITE_HEADER or not header.startswith(bag_layouts.SQLITE):
             continue  # no database: the library knows what it is
         page_bytes, pages = struct.unpack_from(">H", header, 16)[0], _number(header, 28)
         page_bytes = 65536 if page_bytes == 1 else page_bytes

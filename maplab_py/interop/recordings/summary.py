@@ -7,8 +7,7 @@ import numpy as np
 
 from maplab_py.array_types import I64
 from maplab_py.errors import MapError
-from maplab_py.interop.recordings import protocol
-from maplab_py.interop.recordings.clocks import ClockRestart
+from maplab_py.interop.recordings import clocks, protocol
 from maplab_py.interop.recordings.options import StreamOptions
 from maplab_py.interop.recordings.stream import EventStream, StreamStatistics, Times
 from maplab_py.progress import SILENT, Progress
@@ -103,7 +102,7 @@ def summarise(
             progress.check()
             if stream.statistics.frame_sets.count % _PROGRESS_EVERY == 0:
                 progress.line(f"{stream.statistics.frame_sets.count} frame sets")
-    except ClockRestart:
+    except clocks.ClockRestart:
         parts = recording.parts()
     report = _report(recording, stream.statistics, checked, options, encodings)
     report = dataclasses.replace(report, notes=(*report.notes, *unread))

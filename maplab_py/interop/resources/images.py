@@ -7,9 +7,8 @@ import numpy as np
 
 from maplab_py.errors import UserError
 from maplab_py.interop.images import as_8_bits
-from maplab_py.interop.recordings.folders import FolderRecording, image_root
+from maplab_py.interop.recordings import folders, protocol
 from maplab_py.interop.recordings.images import EncodedImage
-from maplab_py.interop.recordings.protocol import CameraImage, RecordedSensors
 from maplab_py.interop.resources import matching
 from maplab_py.interop.resources.matching import ExportedImages, ImportedResources
 from maplab_py.options import Options, option
@@ -54,12 +53,12 @@ def import_images(
         MapError: An image is missing, damaged, or of another size than the camera.
     """
     options = options or ImageImportOptions()
-    root = image_root(folder)
+    root = folders.image_root(folder)
     if root is None:
         raise UserError(f"--dataset_folder={folder}: there is no folder mav0/cam0 or cam0")
     rig = matching.mission_rig(vi_map, mission)
-    recording = FolderRecording(root, RecordedSensors(vi_map.sensors, rig.id))
-    images = [item for item in recording.items() if isinstance(item, CameraImage)]
+    recording = folders.FolderRecording(root, protocol.RecordedSensors(vi_map.sensors, rig.id))
+    images = [item for item in recording.items() if isinstance(item, protocol.CameraImage)]
     new = NewResources(seed=vi_map.missions.id[mission].tobytes())
     rows: list[int] = []
     owners: list[int] = []
@@ -91,7 +90,7 @@ def import_images(
     return attached, report
 
 
-def add_image(new: NewResources, image: CameraImage, *, link: bool) -> int:
+def add_image(new: NewResources, image: protocol.CameraImage, *, link: bool) -> int:
     """Add an image of a recording to the new resources, of more bits the upper eight; return its row.
 
     Raises:

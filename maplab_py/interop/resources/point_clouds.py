@@ -16,8 +16,7 @@ from maplab_py.report import counted
 from maplab_py.sensors import CameraRig
 from maplab_py.storage.resources.new import NewResources
 from maplab_py.storage.resources.types import resource_type
-from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap, from_hex, to_hex
-from maplab_py.vimap.queries import mission_sensor_id, mission_time_spans_ns
+from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap, from_hex, queries, to_hex
 
 # Source: The PCD file format, documentation of PCL, version 0.7.
 
@@ -158,7 +157,7 @@ def import_point_clouds(
     """
     sensor = chosen_sensor(vi_map, mission, sensor_id)
     times, files = stamped_files(folder, (".ply", ".pcd"), "--point_cloud_folder")
-    first_ns, last_ns = mission_time_spans_ns(vi_map)[mission].tolist()
+    first_ns, last_ns = queries.mission_time_spans_ns(vi_map)[mission].tolist()
     inside = (times >= first_ns) & (times <= last_ns)
     if not inside.any():
         raise UserError(
@@ -283,7 +282,7 @@ def chosen_sensor(vi_map: VIMap, mission: int, prefix: str) -> str:
         UserError: The prefix names none or several, or the mission has no lidar.
     """
     if not prefix:
-        lidar = mission_sensor_id(vi_map, mission, MissionSensor.LIDAR)
+        lidar = queries.mission_sensor_id(vi_map, mission, MissionSensor.LIDAR)
         if not lidar:
             raise UserError("the mission has no lidar: name the sensor by --sensor_id")
         return lidar

@@ -9,10 +9,8 @@ import numpy as np
 from maplab_py.array_types import I32, I64, U64, NDArray
 from maplab_py.errors import MapError
 from maplab_py.report import counted
-from maplab_py.storage.protobuf import message_numbers
-from maplab_py.storage.protobuf.descriptor_layout import Blocks, read_blocks, unpack
+from maplab_py.storage.protobuf import descriptor_layout, map_files, message_numbers
 from maplab_py.storage.protobuf.ids import ids_of, ids_of_field, unknown_bytes
-from maplab_py.storage.protobuf.map_files import COPY_AGAIN
 from maplab_py.storage.protobuf.message_numbers import Name
 from maplab_py.vimap import IdIndex, is_valid, tables, to_hex
 from maplab_py.vimap.table import object_column, starts_of_counts
@@ -202,11 +200,11 @@ def _checked_count(frame: Any, place: int, name: Name) -> int:
 
 def _descriptors(
     frame: Any, count: int, place: int, name: Name
-) -> tuple[tables.DescriptorLayout, Blocks | None]:
+) -> tuple[tables.DescriptorLayout, descriptor_layout.Blocks | None]:
     try:
-        return read_blocks(frame.descriptors, frame.descriptor_types, count)
+        return descriptor_layout.read_blocks(frame.descriptors, frame.descriptor_types, count)
     except MapError as error:
-        raise MapError(f"{name(place)}: {error}; {COPY_AGAIN}") from error
+        raise MapError(f"{name(place)}: {error}; {map_files.COPY_AGAIN}") from error
 
 
 def _descriptor_table(table: tables.Frames, max_bytes: int) -> NDArray[np.uint8]:
@@ -273,7 +271,7 @@ def _with_keypoints(
         _fill(columns, rows, frame, count)
         if blocks := table.descriptor_blocks[place]:
             layout = int(table.descriptor_layout[place])
-            unpack(frame.descriptors, layout, blocks, columns["descriptor"][rows])
+            descriptor_layout.unpack(frame.descriptors, layout, blocks, columns["descriptor"][rows])
     owner = np.repeat(np.arange(len(frames)), counts)
     for field in ("uv_px", "sigma_px", "scale"):
         values = columns[field].reshape(total, 2 if field == "uv_px" else 1)

@@ -8,9 +8,8 @@ import numpy as np
 from maplab_py.array_types import I64
 from maplab_py.errors import MapError
 from maplab_py.storage import maplab_map_pb2 as pb
-from maplab_py.storage.protobuf import map_files
+from maplab_py.storage.protobuf import map_files, scan
 from maplab_py.storage.protobuf.ids import ids_of
-from maplab_py.storage.protobuf.scan import MemoryBudget
 from maplab_py.storage.protobuf.tables_from_messages import Content
 from maplab_py.vimap import MapMetadata, ResourceOwner, Resources, as_keys
 
@@ -39,7 +38,7 @@ def read_metadata(folder: Path, max_bytes: int) -> tuple[MapMetadata, list[str]]
 
 
 def read_resources(
-    folder: Path, of_frames: Resources, content: Content, budget: MemoryBudget
+    folder: Path, of_frames: Resources, content: Content, budget: scan.MemoryBudget
 ) -> Resources:
     """Return all references, with the folder that resource_info gives for each.
 

@@ -16,8 +16,7 @@ from maplab_py.storage.protobuf.file_contents import (
     starts,
     words,
 )
-from maplab_py.vimap.table import starts_of_counts
-from maplab_py.vimap.tables import DescriptorLayout, FrameField
+from maplab_py.vimap import table, tables
 
 # The bytes of repeated fields of ids, without an object for each of them.
 #
@@ -62,7 +61,7 @@ def tag_of(message: type[Message], name: str) -> int:
 def id_fields(ids: U64, tag: int) -> IdFields:
     """Return ids (N, 2) as elements of a repeated field with a tag."""
     rows, is_used = id_rows(ids, tag)
-    start: I64 = starts_of_counts(np.count_nonzero(is_used, axis=1))
+    start: I64 = table.starts_of_counts(np.count_nonzero(is_used, axis=1))
     return IdFields(rows[is_used].tobytes(), start.tolist())
 
 
@@ -205,23 +204,23 @@ class _VertexFile:
         frame.is_valid = numbers["frame.is_valid"][row]
         frame.keypoints_px.extend(columns["keypoint.uv_px"][rows].reshape(-1).tolist())
         present = numbers["frame.present"][row]
-        if present & FrameField.SIGMA:
+        if present & tables.FrameField.SIGMA:
             frame.sigmas_px.extend(columns["keypoint.sigma_px"][rows].tolist())
-        if present & FrameField.SCALE:
+        if present & tables.FrameField.SCALE:
             frame.scales.extend(columns["keypoint.scale"][rows].tolist())
-        if present & FrameField.TRACK_ID:
+        if present & tables.FrameField.TRACK_ID:
             frame.track_ids.extend(columns["keypoint.track_id"][rows].tolist())
-        if present & FrameField.POSITION_3D:
+        if present & tables.FrameField.POSITION_3D:
             frame.positions_3d.extend(columns["keypoint.position_3d"][rows].reshape(-1).tolist())
-        if present & FrameField.TIME_OFFSET:
+        if present & tables.FrameField.TIME_OFFSET:
             offsets = columns["keypoint.time_offset_ns"][rows]
             frame.time_offsets_ns.extend(offsets.reshape(-1).tolist())
-        if present & FrameField.LANDMARK_ID or self._observed[row + 1] > self._observed[row]:
+        if present & tables.FrameField.LANDMARK_ID or self._observed[row + 1] > self._observed[row]:
             frame.MergeFromString(self._fields["keypoint.landmark_id"].of(rows))
         if (blocks := columns["frame.descriptor_blocks"][row]) is not None:
             layout = numbers["frame.descriptor_layout"][row]
             frame.descriptors = pack(layout, blocks, columns["keypoint.descriptor"][rows])
-            if layout == DescriptorLayout.BLOCKS:
+            if layout == tables.DescriptorLayout.BLOCKS:
                 frame.descriptor_types.extend(block.feature_type for block in blocks)
         merge_unknown(frame, columns["frame.unknown"][row])
 

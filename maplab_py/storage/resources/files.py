@@ -11,8 +11,7 @@ from maplab_py.cancellation import check_cancelled, lasting_effect
 from maplab_py.errors import UserError
 from maplab_py.options import Options
 from maplab_py.storage.resources import store
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.consistency import ConsistencyReport, Violation
+from maplab_py.vimap import VIMap, consistency
 
 _LISTED = 5
 """Files that one violation names."""
@@ -73,20 +72,20 @@ def orphaned_files(maps: Iterable[VIMap], home: VIMap, map_folder: Path | None) 
 
 
 def with_file_checks(
-    report: ConsistencyReport, vi_map: VIMap, map_folder: Path | None
-) -> ConsistencyReport:
+    report: consistency.ConsistencyReport, vi_map: VIMap, map_folder: Path | None
+) -> consistency.ConsistencyReport:
     """Add missing files to the errors of a consistency check, and orphaned ones to the warnings."""
     missing = missing_files(vi_map, map_folder)
     errors = [*report.errors, *_violation("resource whose file is missing", missing)]
     rule = "file in the map's resource folder that no resource refers to"
     warnings = [*report.warnings, *_violation(rule, orphaned_files((), vi_map, map_folder))]
-    return ConsistencyReport(tuple(errors), tuple(warnings))
+    return consistency.ConsistencyReport(tuple(errors), tuple(warnings))
 
 
-def _violation(rule: str, files: list[Path]) -> list[Violation]:
+def _violation(rule: str, files: list[Path]) -> list[consistency.Violation]:
     if not files:
         return []
-    return [Violation(rule, len(files), tuple(str(file) for file in files[:_LISTED]))]
+    return [consistency.Violation(rule, len(files), tuple(str(file) for file in files[:_LISTED]))]
 
 
 def with_merged_folders(vi_map: VIMap, map_folder: Path | None) -> tuple[VIMap, list[str]]:

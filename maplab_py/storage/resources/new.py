@@ -17,8 +17,7 @@ from maplab_py.atomic.files import make_folders, remove_folders
 from maplab_py.cancellation import check_cancelled, cleaned_up, lasting_effect, provisional_effects
 from maplab_py.storage.resources.store import MAP_FOLDER, path_in_folder
 from maplab_py.storage.resources.types import resource_type
-from maplab_py.vimap import IdArray, ResourceOwner, Resources, VIMap, to_hex
-from maplab_py.vimap.staged_folder import StagedFolder
+from maplab_py.vimap import IdArray, ResourceOwner, Resources, VIMap, staged_folder, to_hex
 
 RAW_IMAGES = 0
 """Number of the resource type of grey images as recorded."""
@@ -45,7 +44,7 @@ class NewResources:
         Raises:
             UserError: The temporary folder cannot be made.
         """
-        self._folder, self._seed = StagedFolder(parent), seed
+        self._folder, self._seed = staged_folder.StagedFolder(parent), seed
         self._ids: list[IdArray] = []
         self._types: list[int] = []
 

@@ -8,18 +8,10 @@ import numpy as np
 
 from maplab_py.array_types import F64, I32, I64
 from maplab_py.geometry import so3
-from maplab_py.sensors import Camera
-from maplab_py.sensors.projection import back_project
-from maplab_py.vision.tracking.motion import (
-    ImageMotion,
-    camera_turn,
-    image_motion,
-    limits_of,
-    summarise,
-)
+from maplab_py.sensors import Camera, projection
+from maplab_py.vision.tracking import motion, views
 from maplab_py.vision.tracking.options import TrackingOptions
 from maplab_py.vision.tracking.tracks import CameraTracks, TrackedImages
-from maplab_py.vision.tracking.views import focal_length_px
 
 
 class TrackedKeypoints(Protocol):
@@ -79,7 +71,7 @@ def tracked_images_of(
     poses = np.asarray(T_I_C, dtype=np.float64).reshape(-1, 7)
     counts = _frame_counts(previous)
     tracks = tuple(_camera_tracks(frame, counts) for frame in frames.frames)
-    motions: list[ImageMotion] = []
+    motions: list[motion.ImageMotion] = []
     for row, camera in enumerate(cameras):
         if previous is None:
             break
@@ -87,15 +79,15 @@ def tracked_images_of(
         _, before, now = np.intersect1d(
             earlier.track_id, tracks[row].track_id, assume_unique=True, return_indices=True
         )
-        ray_C0, is_ray_C0 = back_project(camera, earlier.uv_px[before])
-        ray_C1, is_ray_C1 = back_project(camera, tracks[row].uv_px[now])
+        ray_C0, is_ray_C0 = projection.back_project(camera, earlier.uv_px[before])
+        ray_C1, is_ray_C1 = projection.back_project(camera, tracks[row].uv_px[now])
         rows = is_ray_C0 & is_ray_C1
-        R_C1_C0 = camera_turn(so3.to_matrix(poses[row, :4]), R_I0_I1)
-        limits = limits_of(options, focal_length_px(camera))
+        R_C1_C0 = motion.camera_turn(so3.to_matrix(poses[row, :4]), R_I0_I1)
+        limits = motion.limits_of(options, views.focal_length_px(camera))
         uv_px = tracks[row].uv_px[now][rows]
         rays = ray_C0[rows], ray_C1[rows]
-        motions.append(image_motion(camera, rays, uv_px, R_C1_C0, limits, frames.time_ns))
-    disparity_px, is_turn_only = summarise(motions)
+        motions.append(motion.image_motion(camera, rays, uv_px, R_C1_C0, limits, frames.time_ns))
+    disparity_px, is_turn_only = motion.summarise(motions)
     spent_ms = {"tracks": 1e3 * (time.perf_counter() - start)}
     return TrackedImages(frames.time_ns, tracks, disparity_px, is_turn_only, spent_ms)
 

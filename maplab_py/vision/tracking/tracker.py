@@ -19,6 +19,7 @@ from maplab_py.vision.features.detection import (
     are_apart_before,
     refined,
 )
+from maplab_py.vision.tracking import patch_kernels, stereo_kernels
 from maplab_py.vision.tracking.flow import (
     FlowOptions,
     follow,
@@ -36,8 +37,6 @@ from maplab_py.vision.tracking.motion import (
     summarise,
 )
 from maplab_py.vision.tracking.options import TrackingOptions
-from maplab_py.vision.tracking.patch_kernels import SIDE_PX, align_patches, sample_patches
-from maplab_py.vision.tracking.stereo_kernels import check_matches, expect_distances
 from maplab_py.vision.tracking.tracks import CameraTracks, TrackedImages
 from maplab_py.vision.tracking.views import CameraView, leaders, usable_alone
 
@@ -300,14 +299,14 @@ def align(image: U8, uv: F64, patch: F32, warp: F64) -> AlignedKeypoints:
     """
     uv, patch, warp = uv.copy(), patch.copy(), np.array(warp, order="C")
     is_shown = np.empty(len(uv), dtype=np.bool_)
-    align_patches(image, uv, patch, warp, is_shown)
+    patch_kernels.align_patches(image, uv, patch, warp, is_shown)
     return AlignedKeypoints(uv, patch, warp, is_shown)
 
 
 def patches(image: U8, uv: F64) -> F32:
     """Return the patches (K, S, S) about keypoints (K, 2) of an image (H, W)."""
-    result = np.empty((len(uv), SIDE_PX, SIDE_PX), dtype=np.float32)
-    sample_patches(image, uv, result)
+    result = np.empty((len(uv), patch_kernels.SIDE_PX, patch_kernels.SIDE_PX), dtype=np.float32)
+    patch_kernels.sample_patches(image, uv, result)
     return result
 
 
@@ -355,7 +354,7 @@ def match(
     """
     R_A_B, p_A_B = first.R_I_C.T @ second.R_I_C, first.R_I_C.T @ (second.p_I_C - first.p_I_C)
     expected_m = np.empty(len(tracks))
-    expect_distances(tracks.uv, tracks.distance_m, options.distance_m, expected_m)
+    stereo_kernels.expect_distances(tracks.uv, tracks.distance_m, options.distance_m, expected_m)
     guess, visible = second.pixels((expected_m[:, None] * tracks.ray - p_A_B) @ R_A_B)
     is_due = np.isfinite(tracks.distance_m) | (tracks.num_frames % _RETRY_FRAMES == 1)
     rows = np.flatnonzero(is_due & visible & second.is_usable(guess))
@@ -364,7 +363,7 @@ def match(
     is_match &= exists & second.is_usable(uv)
     gate, distance_m = options.gate_px / second.focal_px, np.full(len(tracks), np.nan)
     of_rows = np.empty(len(rows))
-    check_matches(tracks.ray[rows], ray @ R_A_B.T, p_A_B, gate, is_match, of_rows)
+    stereo_kernels.check_matches(tracks.ray[rows], ray @ R_A_B.T, p_A_B, gate, is_match, of_rows)
     distance_m[rows] = of_rows
     rows, uv = rows[is_match], uv[is_match]
     return StereoMatches(uv, tracks.track_id[rows], tracks.num_frames[rows], distance_m)
@@ -408,7 +407,7 @@ class LiveTracks:
         """Return tracks that begin, numbered from an id on."""
         count = len(uv)
         ids = np.arange(first_id, first_id + count, dtype=np.int64)
-        patch = np.zeros((count, SIDE_PX, SIDE_PX), dtype=np.float32)
+        patch = np.zeros((count, patch_kernels.SIDE_PX, patch_kernels.SIDE_PX), dtype=np.float32)
         warp = np.tile(np.eye(2), (count, 1, 1))
         return cls(
             uv, ray, ids, np.ones(count, dtype=np.int64), np.full(count, np.nan), patch, warp

@@ -9,17 +9,14 @@ from maplab_py.algorithms.evaluation.map_comparison import compare_maps
 from maplab_py.console.session.session import Session
 from maplab_py.errors import FlagError, MapError, UserError
 from maplab_py.geometry import se3
-from maplab_py.vimap import LoopClosureEdges, VIMap, to_hex_list
-from maplab_py.vimap.consistency import check_consistency
-from maplab_py.vimap.edits import merge_landmarks, remove_landmarks
-from maplab_py.vimap.merge import merge_maps
+from maplab_py.vimap import LoopClosureEdges, VIMap, consistency, edits, merge, to_hex_list
 from tests.simulation.small import simulated
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 5])
 def test_cells_cover_the_map_and_are_valid(count: int) -> None:
     first, second = simulated().maps
-    vi_map = merge_maps(first, second)[0]
+    vi_map = merge.merge_maps(first, second)[0]
     cells = split_by_position(vi_map, CellOptions(count=count, overlap_m=0.0))
     assert len(cells) == count
     ids = [vertex for cell in cells for vertex in to_hex_list(cell.vertices.id)]
@@ -28,7 +25,7 @@ def test_cells_cover_the_map_and_are_valid(count: int) -> None:
     sizes = [len(cell.vertices) for cell in cells]
     assert max(sizes) - min(sizes) <= 2
     for cell in cells:
-        assert check_consistency(cell).failure == ""
+        assert consistency.check_consistency(cell).failure == ""
         rows = vi_map.vertex_index.rows(cell.vertices.id)
         np.testing.assert_allclose(cell.T_G_I, vi_map.T_G_I[rows], atol=1e-12)
         rows = vi_map.landmark_index.rows(cell.landmarks.id)
@@ -59,7 +56,7 @@ OVERLAP = CellOptions(count=3, overlap_m=0.6)
 
 def sessions() -> VIMap:
     """Return two sessions with a loop closure edge between vertices that are far apart."""
-    vi_map = merge_maps(*simulated().maps)[0]
+    vi_map = merge.merge_maps(*simulated().maps)[0]
     first, last = 0, len(vi_map.vertices) - 1
     edge = LoopClosureEdges.filled(
         1,
@@ -91,7 +88,7 @@ def test_split_and_join_give_the_map_again(count: int, overlap_m: float) -> None
     cells = split_by_position(vi_map, CellOptions(count=count, overlap_m=overlap_m))
     joined, report = join_cells(cells)
     assert difference(vi_map, joined) == []
-    assert check_consistency(joined).failure == ""
+    assert consistency.check_consistency(joined).failure == ""
     assert report.vertices_shared == sum(len(c.vertices) for c in cells) - len(vi_map.vertices)
     assert report.vertices_differing == report.landmarks_united == 0
     rows = joined.vertex_index.rows(vi_map.vertices.id)
@@ -148,9 +145,9 @@ def test_landmarks_that_one_cell_merged_are_merged() -> None:
     vi_map = sessions()
     cells = split_by_position(vi_map, OVERLAP)
     often = np.argsort(-np.diff(cells[0].observation_start))[:2]
-    merged = merge_landmarks(cells[0], often[:1], often[1:])
+    merged = edits.merge_landmarks(cells[0], often[:1], often[1:])
     joined, _ = join_cells([merged, *cells[1:]])
-    assert check_consistency(joined).failure == ""
+    assert consistency.check_consistency(joined).failure == ""
     assert len(joined.landmarks) in (len(vi_map.landmarks) - 1, len(vi_map.landmarks))
 
 
@@ -163,7 +160,7 @@ def test_what_all_cells_removed_is_gone_and_what_one_kept_stays() -> None:
         rows = cell.landmark_index.rows(everywhere)
         is_removed = np.zeros(len(cell.landmarks), dtype=np.bool_)
         is_removed[rows[rows >= 0]] = True
-        without.append(remove_landmarks(cell, is_removed))
+        without.append(edits.remove_landmarks(cell, is_removed))
     joined, _ = join_cells(without)
     assert (joined.landmark_index.rows(everywhere) < 0).all()
     assert len(joined.landmarks) == len(vi_map.landmarks) - 20

@@ -10,9 +10,8 @@ import pytest
 
 from maplab_py.algorithms.cloud_registration import registration, workflow
 from maplab_py.algorithms.cloud_registration.options import CloudClosureOptions, CloudClosureReport
-from maplab_py.algorithms.loop_closure.closure_record import read_record
+from maplab_py.algorithms.loop_closure import closure_record, record_updates
 from maplab_py.algorithms.loop_closure.listing import find_closures, list_closures
-from maplab_py.algorithms.loop_closure.record_updates import remove_closures
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.relaxation import relax
 from maplab_py.array_types import F64
@@ -231,14 +230,14 @@ def test_clouds_close_loops_that_a_relaxation_uses() -> None:
 
 def test_closures_are_recorded_and_removed_like_those_of_images() -> None:
     vi_map, report = closed()
-    closures = read_record(vi_map).closures
+    closures = closure_record.read_record(vi_map).closures
     assert len(closures) == report.pairs
     listed = list_closures(vi_map)
     assert listed.accepted == report.accepted == listed.shown
     assert {line.use for line in listed.closures} == {"edge"}
     assert max(line.gap_deg for line in listed.closures) < 15.0
     edge = vi_map.loop_closure_edges.id[0]
-    removed, _ = remove_closures(vi_map, find_closures(vi_map, [to_hex(edge)]))
+    removed, _ = record_updates.remove_closures(vi_map, find_closures(vi_map, [to_hex(edge)]))
     assert len(removed.loop_closure_edges) == report.edges_added - 1
     again, second = workflow.close_cloud_loops(removed, Path(), OPTIONS)
     assert "removed by hand" in second.refused

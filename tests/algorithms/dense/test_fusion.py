@@ -7,21 +7,18 @@ import numba
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.dense import fusion
+from maplab_py.algorithms.dense import fusion, meshing, pinhole
 from maplab_py.algorithms.dense.clouds import convert_depth_maps
 from maplab_py.algorithms.dense.field import create_fields
 from maplab_py.algorithms.dense.grid import GridSettings, Mesh, TsdfGrid
-from maplab_py.algorithms.dense.meshing import map_mesh
 from maplab_py.algorithms.dense.options import FusionOptions
-from maplab_py.algorithms.dense.pinhole import Pinhole
 from maplab_py.array_types import F32, F64
 from maplab_py.errors import EstimationError, MapError, UserError
 from maplab_py.interop.ply import PlyCloud, encode_ply
 from maplab_py.interop.resources.depth_maps import import_depth_maps
 from maplab_py.memory import NotEnoughMemory, memory_limited
 from maplab_py.storage.resources.new import NewResources
-from maplab_py.vimap import ResourceOwner, VIMap, resources_of, without_resources
-from maplab_py.vimap.merge import merge_maps
+from maplab_py.vimap import ResourceOwner, VIMap, merge, resources_of, without_resources
 from tests.support.stereo_room import StereoRoom
 
 OPTIONS = FusionOptions(voxel_size_m=0.1)
@@ -45,7 +42,7 @@ def moved(vi_map: VIMap, vertices: slice, motion_m: float) -> VIMap:
 
 
 def distances(room: StereoRoom, vi_map: VIMap, min_weight: float = 0.1) -> F64:
-    mesh, _ = map_mesh(vi_map, Path(), None, min_weight)
+    mesh, _ = meshing.map_mesh(vi_map, Path(), None, min_weight)
     return room.distances_to_surfaces(mesh.p)
 
 
@@ -73,11 +70,11 @@ def test_voxels_that_are_coarse_for_a_near_scene_are_told(
 
 def test_the_grid_moves_with_its_mission(room: StereoRoom, with_depth: VIMap) -> None:
     fused, _ = fusion.fuse_depth(with_depth, Path(), None, OPTIONS)
-    before, _ = map_mesh(fused, Path(), None, 0.1)
+    before, _ = meshing.map_mesh(fused, Path(), None, 0.1)
     T_G_M = np.array(fused.baseframes.T_G_M)
     T_G_M[:, 4:] += [3.0, -2.0, 1.0]
     moved_map = fused.replace(baseframes=fused.baseframes.replace(T_G_M=T_G_M))
-    after, _ = map_mesh(moved_map, Path(), None, 0.1)
+    after, _ = meshing.map_mesh(moved_map, Path(), None, 0.1)
     np.testing.assert_allclose(after.p - before.p, [[3.0, -2.0, 1.0]] * len(after.p), atol=1e-9)
 
 
@@ -86,7 +83,7 @@ def test_clouds_of_cameras_fuse_as_their_depth_maps_do(room: StereoRoom, with_de
     fused, report = fusion.fuse_depth(clouds, Path(), None, OPTIONS, input_type=16)
     assert report.resource_type == "point_cloud"
     expected, _ = fusion.fuse_depth(with_depth, Path(), None, OPTIONS)
-    mesh, same = map_mesh(fused, Path())[0], map_mesh(expected, Path())[0]
+    mesh, same = meshing.map_mesh(fused, Path())[0], meshing.map_mesh(expected, Path())[0]
     assert abs(len(mesh.p) - len(same.p)) < 0.01 * len(same.p)
     assert distances(room, fused).mean() < 1.1 * distances(room, expected).mean() + 1e-4
 
@@ -123,7 +120,7 @@ def test_small_motion_is_left_alone(with_depth: VIMap) -> None:
 
 
 def test_missions_in_unknown_frames_have_their_own_grids(with_depth: VIMap) -> None:
-    both, _ = merge_maps(with_depth, with_depth, assign_new_ids=True)
+    both, _ = merge.merge_maps(with_depth, with_depth, assign_new_ids=True)
     apart, report = fusion.fuse_depth(both, Path(), None, OPTIONS)
     assert [grid.missions for grid in report.grids] == [1, 1]
     assert "unknown base frames" in report.notes[0]
@@ -148,7 +145,7 @@ def test_bad_input_is_refused(room: StereoRoom, with_depth: VIMap) -> None:
         fusion.fuse_depth(with_depth, Path(), input_type=9)
     with pytest.raises(UserError, match="wants one of 8, 9, 16"):
         fusion.fuse_depth(with_depth, Path(), input_type=0)
-    for function in (fusion.update_grids, map_mesh):
+    for function in (fusion.update_grids, meshing.map_mesh):
         with pytest.raises(UserError, match="create_tsdf_from_depth_resource makes one"):
             function(with_depth, Path())
     fused, _ = fusion.fuse_depth(with_depth, Path(), None, OPTIONS)
@@ -157,7 +154,7 @@ def test_bad_input_is_refused(room: StereoRoom, with_depth: VIMap) -> None:
     replaced, _ = fusion.fuse_depth(fused, Path(), None, OPTIONS, overwrite=True)
     np.testing.assert_array_equal(replaced.resources.id, fused.resources.id)
     with pytest.raises(EstimationError, match="--dense_tsdf_mesh_min_weight"):
-        map_mesh(fused, Path(), None, 1e9)
+        meshing.map_mesh(fused, Path(), None, 1e9)
     with pytest.raises(MapError, match="depth maps of the grid are not in the map"):
         fusion.update_grids(without_resources(fused, resources_of(fused, (8,))), Path())
 
@@ -166,7 +163,7 @@ def test_grids_of_other_programs_are_refused(with_depth: VIMap) -> None:
     new = NewResources()
     foreign = new.attached(with_depth, [new.add(18, b"\x0a\x05")], [0], ResourceOwner.MISSION)
     with pytest.raises(MapError, match=r"C\+\+ maplab's are not read"):
-        map_mesh(foreign, Path())
+        meshing.map_mesh(foreign, Path())
 
 
 @pytest.mark.parametrize(
@@ -202,7 +199,7 @@ def test_depth_maps_of_another_size_are_refused(room: StereoRoom) -> None:
             function(vi_map, Path())
 
 
-PINHOLE = Pinhole(100.0, (79.5, 59.5), 160, 120)
+PINHOLE = pinhole.Pinhole(100.0, (79.5, 59.5), 160, 120)
 SETTINGS = GridSettings(0.05, 0.15, 0.1, 6.0, 2, 1e4)
 RADIUS_M = 0.6
 

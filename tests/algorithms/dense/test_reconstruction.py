@@ -8,12 +8,11 @@ import numba
 import numpy as np
 import pytest
 
+from maplab_py.algorithms.dense import depth_matcher, rectification
 from maplab_py.algorithms.dense.clouds import convert_depth_maps, depth_of_cloud
-from maplab_py.algorithms.dense.depth_matcher import DepthMatcher
 from maplab_py.algorithms.dense.options import BmOptions, SgbmOptions, StereoOptions
 from maplab_py.algorithms.dense.pinhole import ImageMap, undistorted
 from maplab_py.algorithms.dense.reconstruction import StereoSettings, reconstruct_stereo
-from maplab_py.algorithms.dense.rectification import StereoPair, stereo_pairs
 from maplab_py.algorithms.dense.resources import FrameResources
 from maplab_py.array_types import F64
 from maplab_py.errors import MapError, UserError
@@ -72,8 +71,8 @@ def make_rig(
     return CameraRig("0" * 32, cameras, np.array(T_B_C))
 
 
-def pairs_of(rig: CameraRig) -> tuple[list[StereoPair], list[str]]:
-    return stereo_pairs(rig, min_baseline_m=0.02, max_angle_rad=0.785)
+def pairs_of(rig: CameraRig) -> tuple[list[rectification.StereoPair], list[str]]:
+    return rectification.stereo_pairs(rig, min_baseline_m=0.02, max_angle_rad=0.785)
 
 
 def sampled(image: ImageMap, u: Any, v: Any) -> F64:
@@ -294,16 +293,16 @@ def test_near_scenes_are_matched_over_more_disparities() -> None:
     (pair,), _ = pairs_of(make_rig())
     width, focal_baseline = pair.pinhole.width_px, pair.pinhole.focal_px * pair.baseline_m
     options = StereoOptions(), SgbmOptions(), BmOptions()
-    usual = DepthMatcher(pair, *options)
+    usual = depth_matcher.DepthMatcher(pair, *options)
     assert usual.disparities_px == (width // 8 + 15) & -16
     near_m = 0.6 * usual.nearest_m
-    near = DepthMatcher(pair, *options, near_m)
+    near = depth_matcher.DepthMatcher(pair, *options, near_m)
     assert near.nearest_m <= near_m < usual.nearest_m
     assert near.nearest_m == pytest.approx(focal_baseline / near.disparities_px)
-    assert DepthMatcher(pair, *options, 5.0).disparities_px == usual.disparities_px
-    assert DepthMatcher(pair, *options, 1e-6).disparities_px <= 0.4 * width + 16
+    assert depth_matcher.DepthMatcher(pair, *options, 5.0).disparities_px == usual.disparities_px
+    assert depth_matcher.DepthMatcher(pair, *options, 1e-6).disparities_px <= 0.4 * width + 16
     as_given = StereoOptions(adapt_params_to_image_size=False)
-    assert DepthMatcher(pair, as_given, *options[1:], near_m).disparities_px == 128
+    assert depth_matcher.DepthMatcher(pair, as_given, *options[1:], near_m).disparities_px == 128
 
 
 def test_bad_input_is_refused_in_one_line(room: StereoRoom, with_images: VIMap) -> None:

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.evaluation import pose_errors
-from maplab_py.algorithms.evaluation.map_comparison import compare_maps
+from maplab_py.algorithms.evaluation import map_comparison, pose_errors
 from maplab_py.algorithms.evaluation.options import TrajectoryEvaluationOptions
 from maplab_py.algorithms.evaluation.trajectory_evaluation import evaluate_trajectory, match
 from maplab_py.errors import EstimationError
@@ -334,7 +333,7 @@ def test_raw_euroc_submaps(relative: str, matched: int, rmse: float) -> None:
 
 
 def test_a_map_equals_itself() -> None:
-    report = compare_maps(make_map(), make_map())
+    report = map_comparison.compare_maps(make_map(), make_map())
     assert report.is_identical
     assert all(row.only_in_first == row.only_in_second == 0 for row in report.rows)
     assert report.position_m.largest == report.keypoint_px.largest == 0.0
@@ -358,7 +357,7 @@ def test_every_difference_is_measured() -> None:
         keypoints=first.keypoints.replace(uv_px=uv, landmark=landmark, descriptor=descriptor),
         landmarks=first.landmarks.replace(quality=quality),
     )
-    report = compare_maps(first, second)
+    report = map_comparison.compare_maps(first, second)
     assert not report.is_identical
     assert report.position_m.largest == pytest.approx(0.3)
     assert report.rotation_deg.largest == pytest.approx(2.0)
@@ -369,7 +368,7 @@ def test_every_difference_is_measured() -> None:
 
 
 def test_maps_with_nothing_in_common() -> None:
-    report = compare_maps(make_map(), VIMap())
+    report = map_comparison.compare_maps(make_map(), VIMap())
     rows = {row.what: row for row in report.rows}
     assert (rows["vertices"].in_both, rows["vertices"].only_in_first) == (0, 12)
     assert report.position_m.compared == 0

@@ -6,22 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.image_features import extraction
+from maplab_py.algorithms.image_features import extraction, tracks
 from maplab_py.algorithms.image_features.extraction import extract_features
 from maplab_py.algorithms.image_features.options import ExtractionOptions, FeatureTrackOptions
-from maplab_py.algorithms.image_features.tracks import track_features
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
 from maplab_py.algorithms.landmarks.tracks import init_tracks
 from maplab_py.errors import Cancelled, EstimationError, FlagError, MaplabError, UserError
 from maplab_py.interop.resources.images import import_images
 from maplab_py.progress import SilentProgress
 from maplab_py.storage.native import load_map, save_map
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.consistency import check_consistency
-from maplab_py.vimap.table import object_column
-from maplab_py.vision.features import extension
+from maplab_py.vimap import VIMap, consistency, table
+from maplab_py.vision.features import extension, extractors
 from maplab_py.vision.features.extension import ExtractedFeatures, feature_extractor
-from maplab_py.vision.features.extractors import KINDS
 from tests.support.small_xfeat import xfeat_or_skip
 from tests.support.stereo_room import StereoRoom, quarter_size
 
@@ -58,7 +54,7 @@ def same_tables(a: VIMap, b: VIMap) -> bool:
 
 
 def test_features_follow_the_keypoints_of_a_frame(with_images: VIMap, sift: VIMap) -> None:
-    assert not check_consistency(sift).errors
+    assert not consistency.check_consistency(sift).errors
     of_sift = sift.feature_type == 3
     assert np.count_nonzero(of_sift) == 250 * len(sift.frames)
     old, before = sift.keypoints.take(np.flatnonzero(~of_sift)), with_images.keypoints
@@ -83,7 +79,7 @@ def test_a_map_with_features_is_saved_and_loaded(sift: VIMap, tmp_path: Path) ->
     assert same_tables(again, sift)
 
 
-@pytest.mark.parametrize("name", sorted(KINDS))
+@pytest.mark.parametrize("name", sorted(extractors.KINDS))
 def test_the_features_do_not_depend_on_threads(
     with_images: VIMap, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -94,7 +90,7 @@ def test_the_features_do_not_depend_on_threads(
     monkeypatch.setattr(extraction.os, "cpu_count", lambda: 1)
     single, _ = extract_features(with_images, Path(), options)
     assert same_tables(several, single)
-    assert report.descriptor_bytes == KINDS[name].size
+    assert report.descriptor_bytes == extractors.KINDS[name].size
     assert 0 < report.keypoints <= 60 * report.images
 
 
@@ -102,7 +98,7 @@ def test_frames_that_have_such_features_stay_unless_replaced(sift: VIMap) -> Non
     again, report = extract_features(sift, Path(), SIFT)
     assert again.keypoints is sift.keypoints or same_tables(again, sift)
     assert (report.images, report.frames_that_had_some) == (0, len(sift.frames))
-    tracked, _ = track_features(sift, FeatureTrackOptions())
+    tracked, _ = tracks.track_features(sift, FeatureTrackOptions())
     with_landmarks, _ = init_tracks(tracked, LandmarkQualityOptions())
     made = int(np.count_nonzero(with_landmarks.landmarks.feature_type == 3))
     assert made > 50
@@ -111,11 +107,11 @@ def test_frames_that_have_such_features_stay_unless_replaced(sift: VIMap) -> Non
     assert report.keypoints_removed == np.count_nonzero(sift.feature_type == 3)
     assert report.landmarks_removed == made
     assert np.count_nonzero(replaced.feature_type == 3) == 100 * len(sift.frames)
-    assert not check_consistency(replaced).errors
+    assert not consistency.check_consistency(replaced).errors
 
 
 def test_tracks_show_one_point_of_the_room(room: StereoRoom, sift: VIMap) -> None:
-    tracked, report = track_features(sift, FeatureTrackOptions())
+    tracked, report = tracks.track_features(sift, FeatureTrackOptions())
     assert report.frame_pairs == 2 * (2 * len(sift.vertices) - 3)
     assert report.tracks > 150
     assert report.mean_track_length > 2.5
@@ -133,11 +129,11 @@ def test_tracks_show_one_point_of_the_room(room: StereoRoom, sift: VIMap) -> Non
     assert np.median(distance) < 0.03
     assert np.mean(distance > 0.3) < 0.05
     with pytest.raises(EstimationError, match="no Binary descriptors of 32 bytes"):
-        track_features(sift, FeatureTrackOptions(feature_type="orb"))
+        tracks.track_features(sift, FeatureTrackOptions(feature_type="orb"))
 
 
 def test_frames_that_share_nothing_have_no_tracks(sift: VIMap) -> None:
-    tracked, report = track_features(sift, FeatureTrackOptions(max_descriptor_distance=1e-6))
+    tracked, report = tracks.track_features(sift, FeatureTrackOptions(max_descriptor_distance=1e-6))
     assert (report.matches, report.tracks, report.mean_track_length) == (0, 0, 0.0)
     assert same_tables(tracked, sift)
 
@@ -146,7 +142,7 @@ def test_all_tracked_keypoints_are_left_alone(sift: VIMap) -> None:
     ids = np.arange(len(sift.keypoints), dtype=np.int32)
     numbered = sift.replace(keypoints=sift.keypoints.replace(track_id=ids))
     with pytest.raises(EstimationError, match="SIFT of 128 bytes have a track or a landmark"):
-        track_features(numbered, FeatureTrackOptions())
+        tracks.track_features(numbered, FeatureTrackOptions())
 
 
 def test_a_cancelled_extraction_ends_at_once(with_images: VIMap) -> None:
@@ -165,7 +161,7 @@ def test_maps_without_images_and_bare_keypoints_are_refused(
         extract_features(room.true_map, Path(), SIFT)
     frames = with_images.frames
     bare = with_images.replace(
-        frames=frames.replace(descriptor_blocks=object_column([None] * len(frames)))
+        frames=frames.replace(descriptor_blocks=table.object_column([None] * len(frames)))
     )
     with pytest.raises(
         UserError, match="keypoints without descriptors, which the map format cannot"

@@ -6,9 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.image_features.extraction import extract_features
+from maplab_py.algorithms.image_features import extraction, tracks
 from maplab_py.algorithms.image_features.options import ExtractionOptions, FeatureTrackOptions
-from maplab_py.algorithms.image_features.tracks import track_features
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
 from maplab_py.algorithms.landmarks.tracks import init_tracks
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
@@ -19,9 +18,7 @@ from maplab_py.simulation.scenario import SessionImages
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.truth import Truth
 from maplab_py.storage.native import load_map
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.merge import merge_maps
-from maplab_py.vimap.table import object_column
+from maplab_py.vimap import VIMap, merge, table
 from tests.algorithms.loop_closure.against_truth import is_right
 
 pytestmark = pytest.mark.slow
@@ -46,7 +43,7 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> tuple[VIMap, Truth]:
         import_images(load_map(folder / name)[0], 0, folder / "raw" / name)[0]
         for name in ("session_1", "session_2")
     ]
-    return without_features(merge_maps(*maps)[0]), Truth.load(folder / "truth.npz")
+    return without_features(merge.merge_maps(*maps)[0]), Truth.load(folder / "truth.npz")
 
 
 def without_features(vi_map: VIMap) -> VIMap:
@@ -55,7 +52,7 @@ def without_features(vi_map: VIMap) -> VIMap:
     return vi_map.replace(
         frames=frames.replace(
             keypoint_count=np.zeros(len(frames), dtype=np.int32),
-            descriptor_blocks=object_column([None] * len(frames)),
+            descriptor_blocks=table.object_column([None] * len(frames)),
         ),
         keypoints=vi_map.keypoints.take(np.zeros(0, dtype=np.int64)),
         landmarks=vi_map.landmarks.take(np.zeros(0, dtype=np.int64)),
@@ -64,10 +61,10 @@ def without_features(vi_map: VIMap) -> VIMap:
 
 def closed(vi_map: VIMap, truth: Truth, name: str, feature_type: str) -> tuple[int, int]:
     """Return how many vertices have a right closure, and how many accepted closures are wrong."""
-    described, _ = extract_features(
+    described, _ = extraction.extract_features(
         vi_map, Path(), ExtractionOptions(feature_type=name, max_features=400)
     )
-    tracked, _ = track_features(described, FeatureTrackOptions(feature_type=name))
+    tracked, _ = tracks.track_features(described, FeatureTrackOptions(feature_type=name))
     mapped, _ = init_tracks(tracked, LandmarkQualityOptions())
     search, _ = search_loops(mapped, LoopClosureOptions(feature_type=feature_type))
     closures = search.closures

@@ -8,15 +8,12 @@ import pytest
 
 from maplab_py.algorithms.keyframing.heuristic import Reason, choose_keyframes, keyframe
 from maplab_py.algorithms.keyframing.options import KeyframingOptions
-from maplab_py.estimation.imu.inertial_data import InertialData
-from maplab_py.estimation.imu.preintegration import propagate
+from maplab_py.estimation.imu import inertial_data, preintegration
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Imu
 from maplab_py.simulation.scenario import MeasurementOptions, Scenario, SessionOptions
 from maplab_py.simulation.simulate import simulate
-from maplab_py.vimap import AbsolutePoses, IdIndex, LoopClosureEdges, VIMap
-from maplab_py.vimap.consistency import check_consistency
-from maplab_py.vimap.merge import merge_maps
+from maplab_py.vimap import AbsolutePoses, IdIndex, LoopClosureEdges, VIMap, consistency, merge
 from tests.simulation.small import simulated
 from tests.support.machine import slowness
 from tests.vimap.builders import walk_map
@@ -49,13 +46,13 @@ def test_keyframing_keeps_ends_and_chains_and_counts():
     thin, report = keyframe(m, KeyframingOptions(**LOOSE))
     assert report.vertices_after == len(thin.vertices) == 6
     assert report.mission_ends == 2
-    assert check_consistency(thin).errors == ()
+    assert consistency.check_consistency(thin).errors == ()
     np.testing.assert_array_equal(thin.vertices.id[[0, -1]], m.vertices.id[[0, -1]])
     assert report.observations_removed == len(m.observations) - len(thin.observations)
 
 
 def test_other_missions_are_left_alone():
-    m, _ = merge_maps(walk_map(), walk_map(seed=1))
+    m, _ = merge.merge_maps(walk_map(), walk_map(seed=1))
     thin, _ = keyframe(m, KeyframingOptions(**LOOSE), missions=np.array([1]))
     assert np.bincount(thin.vertices.mission).tolist() == [12, 6]
 
@@ -112,11 +109,11 @@ def test_as_many_shared_landmarks_as_wanted_are_enough():
 GRAVITY = np.array([0.0, 0.0, -9.81])
 
 
-def inertial(vi_map: VIMap, edges: slice) -> InertialData:
+def inertial(vi_map: VIMap, edges: slice) -> inertial_data.InertialData:
     start = vi_map.sample_start
     rows = slice(start[edges.start], start[edges.stop])
     count = edges.stop - edges.start
-    return InertialData(
+    return inertial_data.InertialData(
         start[edges.start : edges.stop + 1] - start[edges.start],
         vi_map.imu_samples.timestamp_ns[rows],
         np.ascontiguousarray(vi_map.imu_samples.accel_gyro[rows]),
@@ -132,7 +129,7 @@ def largest_difference(before: VIMap, after: VIMap) -> tuple[float, float]:
     biases = v.gyro_bias[:-1], v.accel_bias[:-1]
     count = len(after.imu_edges)
     assert count == len(v) - 1
-    T, speed = propagate(
+    T, speed = preintegration.propagate(
         inertial(after, slice(0, count)), v.T_M_I[:-1], v.v_M[:-1], *biases, GRAVITY
     )
     last = after.sample_start[1:] - 1
@@ -141,7 +138,7 @@ def largest_difference(before: VIMap, after: VIMap) -> tuple[float, float]:
         T_M_I, v_M = v.T_M_I[edge][None], v.v_M[edge][None]
         for small in range(int(first[edge]), int(first[edge + 1])):
             data = inertial(before, slice(small, small + 1))
-            poses, speeds = propagate(
+            poses, speeds = preintegration.propagate(
                 data, T_M_I, v_M, v.gyro_bias[edge], v.accel_bias[edge], GRAVITY
             )
             T_M_I, v_M = poses[-1:], speeds[-1:]
@@ -181,7 +178,7 @@ def test_ten_minutes_at_ten_hertz():
     after, report = keyframe(before, KeyframingOptions(min_shared_landmarks_obs=5))
     seconds = time.process_time() - begin
     assert report.vertices_after < 2000
-    assert check_consistency(after).errors == ()
+    assert consistency.check_consistency(after).errors == ()
     position, rotation = largest_difference(before, after)
     assert position < 1e-9
     assert rotation < 1e-9

@@ -8,18 +8,13 @@ import pytest
 from maplab_py.algorithms.gate import any_failed
 from maplab_py.algorithms.keyframing.heuristic import keyframe
 from maplab_py.algorithms.keyframing.options import KeyframingOptions
-from maplab_py.algorithms.landmarks import quality
+from maplab_py.algorithms.landmarks import quality, sightings, tracks, triangulation
 from maplab_py.algorithms.landmarks.options import InvalidObservationOptions, LandmarkQualityOptions
 from maplab_py.algorithms.landmarks.removal import remove_bad, remove_invalid_observations
-from maplab_py.algorithms.landmarks.sightings import rays_in_G
-from maplab_py.algorithms.landmarks.tracks import init_tracks
-from maplab_py.algorithms.landmarks.triangulation import retriangulate
 from maplab_py.algorithms.loop_closure.workflow import close_loops
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
-from maplab_py.vimap import LandmarkQuality, VIMap, ragged_rows
-from maplab_py.vimap.consistency import check_consistency
-from maplab_py.vimap.edits import remove_landmarks, remove_observations, with_p_G
+from maplab_py.vimap import LandmarkQuality, VIMap, consistency, edits, ragged_rows
 from tests.algorithms.loop_closure.rooms import Walk, make_map
 from tests.vimap.builders import walk_map
 
@@ -28,12 +23,12 @@ OPTIONS = LandmarkQualityOptions(min_observers=10)
 
 def disturbed(m: VIMap, sigma_m: float) -> VIMap:
     noise = np.random.default_rng(5).normal(size=m.p_G.shape) * sigma_m
-    return with_p_G(m, np.arange(len(m.landmarks)), m.p_G + noise)
+    return edits.with_p_G(m, np.arange(len(m.landmarks)), m.p_G + noise)
 
 
 def test_retriangulation_restores_every_seen_landmark():
     m = walk_map()
-    result, report = retriangulate(disturbed(m, 5.0), OPTIONS)
+    result, report = triangulation.retriangulate(disturbed(m, 5.0), OPTIONS)
     seen = np.diff(m.observation_start) >= 2
     assert report.triangulated == np.count_nonzero(seen)
     assert report.too_few_observations == np.count_nonzero(~seen)
@@ -48,7 +43,7 @@ def test_good_needs_observers_angle_and_place():
     assert 0 < report.good < len(m.landmarks)
     assert np.all(np.diff(m.observation_start)[good] >= 10)
     row = int(np.flatnonzero(good)[0])
-    behind = with_p_G(m, [row], 2.0 * m.T_G_M[0, 4:] - m.p_G[[row]] - [0.0, 0.0, 20.0])
+    behind = edits.with_p_G(m, [row], 2.0 * m.T_G_M[0, 4:] - m.p_G[[row]] - [0.0, 0.0, 20.0])
     worse, report_behind = quality.evaluate_quality(behind, OPTIONS)
     assert report_behind.good == report.good - 1
     assert report_behind.too_near_or_behind >= 1
@@ -63,7 +58,7 @@ def test_bad_landmarks_go_and_quality_can_be_reset():
     left, removal = remove_bad(judged)
     assert removal.landmarks_removed == report.bad
     assert len(left.landmarks) == report.good
-    assert check_consistency(left).errors == ()
+    assert consistency.check_consistency(left).errors == ()
     fresh, after = quality.reset_quality(judged)
     assert after.unknown == len(fresh.landmarks)
     assert not np.any(fresh.landmarks.quality)
@@ -71,16 +66,16 @@ def test_bad_landmarks_go_and_quality_can_be_reset():
 
 def test_tracks_become_the_landmarks_they_were():
     m = walk_map()
-    gone = remove_landmarks(m, np.ones(len(m.landmarks), dtype=bool))
-    again, report = init_tracks(gone, OPTIONS)
+    gone = edits.remove_landmarks(m, np.ones(len(m.landmarks), dtype=bool))
+    again, report = tracks.init_tracks(gone, OPTIONS)
     enough = np.diff(m.observation_start) >= 2
     assert report.landmarks_added == np.count_nonzero(enough)
-    assert check_consistency(again).errors == ()
+    assert consistency.check_consistency(again).errors == ()
     observing = again.observations
     true = m.p_G[m.keypoints.landmark[observing]]
     np.testing.assert_allclose(again.p_G[again.keypoints.landmark[observing]], true, atol=1e-6)
-    assert init_tracks(again, OPTIONS)[1].landmarks_added == 0
-    same, _ = init_tracks(gone, OPTIONS)
+    assert tracks.init_tracks(again, OPTIONS)[1].landmarks_added == 0
+    same, _ = tracks.init_tracks(gone, OPTIONS)
     np.testing.assert_array_equal(same.landmarks.id, again.landmarks.id)
 
 
@@ -120,7 +115,7 @@ def with_two_observers(vi_map: VIMap, *, far_apart: bool) -> tuple[VIMap, np.nda
     first = last - counts[many] + 1
     kept = np.concatenate([first, last if far_apart else first + 1])
     removed = np.delete(vi_map.observations[rows], kept)
-    return remove_observations(vi_map, removed), many
+    return edits.remove_observations(vi_map, removed), many
 
 
 def is_good(vi_map: VIMap, landmarks: np.ndarray, options: LandmarkQualityOptions) -> np.ndarray:
@@ -142,7 +137,7 @@ def test_two_observers_at_a_wide_angle_are_enough():
 @pytest.mark.parametrize("coordinate", [1e12, 1e160, -1e300])
 def test_landmarks_at_infinity_are_bad(coordinate):
     vi_map, landmarks = with_two_observers(make_map(TWICE)[0], far_apart=True)
-    far = with_p_G(vi_map, landmarks, np.full((len(landmarks), 3), coordinate))
+    far = edits.with_p_G(vi_map, landmarks, np.full((len(landmarks), 3), coordinate))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert not is_good(far, landmarks, DEFAULT).any()
@@ -151,9 +146,9 @@ def test_landmarks_at_infinity_are_bad(coordinate):
 def test_a_landmark_at_its_camera_is_bad():
     vi_map, landmarks = with_two_observers(make_map(TWICE)[0], far_apart=True)
     keypoints = vi_map.observations[vi_map.observation_start[landmarks]]
-    origins = rays_in_G(vi_map, keypoints)[0]
+    origins = sightings.rays_in_G(vi_map, keypoints)[0]
     for offset_m in (0.0, 1e-9, 1e-160):
-        near = with_p_G(vi_map, landmarks, origins + offset_m)
+        near = edits.with_p_G(vi_map, landmarks, origins + offset_m)
         assert not is_good(near, landmarks, DEFAULT).any()
 
 
@@ -179,7 +174,7 @@ def test_a_landmark_beside_its_rays_is_uncertain_and_one_wrong_keypoint_does_not
     vi_map, _ = make_map(TWICE)
     landmarks = np.flatnonzero(np.diff(vi_map.observation_start) >= 8)
     usual = quality.predicted_sigma(vi_map, landmarks)
-    beside = with_p_G(vi_map, landmarks, vi_map.p_G[landmarks] + [0.0, 1.0, 0.0])
+    beside = edits.with_p_G(vi_map, landmarks, vi_map.p_G[landmarks] + [0.0, 1.0, 0.0])
     assert np.all(quality.predicted_sigma(beside, landmarks) > 10.0 * usual)
     assert fails(beside, landmarks, "too_uncertain").all()
     uv = vi_map.keypoints.uv_px.copy()
@@ -226,10 +221,10 @@ def test_keyframing_and_optvi_say_when_they_leave_most_landmarks_bad():
     )  # fmt: skip
     two, report = keyframe(vi_map, few)
     assert report.vertices_after == 2
-    _, blind = keyframe(remove_observations(vi_map, np.flatnonzero(ends)), few)
+    _, blind = keyframe(edits.remove_observations(vi_map, np.flatnonzero(ends)), few)
     assert blind.landmarks_undetermined > 0.9 * len(vi_map.landmarks)
     assert "fewer than two observations" in blind.note
-    only_first = remove_observations(two, np.flatnonzero(two.keypoint_vertex == 1)[5:])
+    only_first = edits.remove_observations(two, np.flatnonzero(two.keypoint_vertex == 1)[5:])
     options = VIOptimizationOptions(include_inertial=False, num_iterations=1)
     _, optimized = optimize(only_first, options)
     assert "landmarks are bad" in optimized.note

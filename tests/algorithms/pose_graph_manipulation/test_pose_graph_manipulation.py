@@ -18,10 +18,7 @@ from maplab_py.algorithms.pose_graph_manipulation.layout import (
 from maplab_py.algorithms.pose_graph_manipulation.stationary_options import StationaryOptions
 from maplab_py.errors import FlagError, UserError
 from maplab_py.geometry import se3, so3
-from maplab_py.vimap import VIMap, to_hex
-from maplab_py.vimap.consistency import check_consistency
-from maplab_py.vimap.edits import remove_loop_closure_edges
-from maplab_py.vimap.merge import merge_maps
+from maplab_py.vimap import VIMap, consistency, edits, merge, to_hex
 from tests.simulation.small import simulated
 from tests.vimap.builders import walk_map
 
@@ -52,7 +49,7 @@ def test_missing_edges_and_bad_values_are_refused():
         assign_switch_variables(m, value=1.5)
     with pytest.raises(FlagError, match="variance"):
         assign_switch_variables(m, variance=0.0)
-    without = remove_loop_closure_edges(m, np.array([0, 1]))
+    without = edits.remove_loop_closure_edges(m, np.array([0, 1]))
     with pytest.raises(UserError, match="no loop closure edge"):
         assign_switch_variables(without, value=0.5)
 
@@ -68,7 +65,7 @@ def test_switch_variables_are_set():
 
 
 def test_disturbance_starts_at_zero_and_stays_within_its_limits():
-    m, _ = merge_maps(walk_map(vertices=200), walk_map(seed=1))
+    m, _ = merge.merge_maps(walk_map(vertices=200), walk_map(seed=1))
     options = DisturbanceOptions(
         max_translational_disturbance_norm_m=0.03,
         translation_random_walk_sigma_m=0.01,
@@ -101,8 +98,8 @@ def test_the_same_seed_disturbs_equally():
 
 
 def test_missions_of_unknown_base_frame_are_laid_apart():
-    m, _ = merge_maps(walk_map(), walk_map(seed=1))
-    m, _ = merge_maps(m, walk_map(seed=2))
+    m, _ = merge.merge_maps(walk_map(), walk_map(seed=1))
+    m, _ = merge.merge_maps(m, walk_map(seed=2))
     known = m.baseframes.replace(is_known=[True, False, False])
     m = m.replace(baseframes=known)
     row, count = distribute_missions(m, LayoutOptions(meters=10.0, dimension=1))
@@ -142,14 +139,14 @@ def standing(vi_map: VIMap, mission: int, moved_m: float) -> VIMap:
 
 
 def test_only_the_mission_that_stands_still_is_tied_and_only_once() -> None:
-    both = standing(merge_maps(*simulated().maps)[0], 1, 0.05)
+    both = standing(merge.merge_maps(*simulated().maps)[0], 1, 0.05)
     tied, missions = tie_stationary(both, OPTIONS)
     assert missions == (to_hex(both.missions.id[1]),)
     edges = tied.loop_closure_edges
     rows = np.flatnonzero(both.vertices.mission == 1)
     assert (edges.from_vertex.tolist(), edges.to_vertex.tolist()) == ([rows[0]], [rows[-1]])
     assert np.array_equal(edges.T_A_B[0], se3.identity())
-    assert check_consistency(tied).errors == ()
+    assert consistency.check_consistency(tied).errors == ()
     again, _ = tie_stationary(tied, OPTIONS)
     assert len(again.loop_closure_edges) == 1
 

@@ -26,9 +26,8 @@ from maplab_py.frontend.odometry_options import OdometryOptions
 from maplab_py.frontend.run_options import RunOptions
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.device import RecordedSensors, make_device
-from maplab_py.interop.recordings.map_replay import MapRecording
+from maplab_py.interop.recordings import map_replay, protocol
 from maplab_py.interop.recordings.options import StreamOptions
-from maplab_py.interop.recordings.protocol import Recording
 from maplab_py.sensors import Camera, Distortion, Imu, Projection
 from maplab_py.sensors.projection import project
 from maplab_py.simulation.scenario import MotionOptions
@@ -224,7 +223,7 @@ MOTION = (
 )
 MIRRORED = "axes of the gyroscope"
 MOUNTING = "rotation of the extrinsics"
-FAULTS: dict[str, tuple[Callable[[Recording], Recording], str, str]] = {
+FAULTS: dict[str, tuple[Callable[[protocol.Recording], protocol.Recording], str, str]] = {
     "gyroscope in deg/s": (
         lambda r: faults.with_imu(r, EYE, np.degrees(EYE)),
         "unit of the gyroscope",
@@ -275,8 +274,8 @@ FAULTS: dict[str, tuple[Callable[[Recording], Recording], str, str]] = {
 
 
 @functools.cache
-def mission() -> MapRecording:
-    return MapRecording(replayed(MOTION)[0], 0)
+def mission() -> map_replay.MapRecording:
+    return map_replay.MapRecording(replayed(MOTION)[0], 0)
 
 
 @pytest.mark.parametrize("name", FAULTS)
@@ -380,7 +379,7 @@ def test_a_sound_recording_and_a_hopeless_one_stay() -> None:
 
 def test_a_run_that_is_lost_is_mended_or_noted() -> None:
     short = (MOTION[0], dataclasses.replace(MOTION[1], duration_s=4.0, turns=0.2))
-    wrong = faults.with_imu(MapRecording(replayed(short)[0], 0), EYE / 9.81, EYE)
+    wrong = faults.with_imu(map_replay.MapRecording(replayed(short)[0], 0), EYE / 9.81, EYE)
     mapping = run_checked(Mapping, wrong)
     notes = finish(mapping, wrong.name).report.notes
     assert any(
@@ -414,7 +413,7 @@ def test_a_map_that_contradicts_its_calibration_is_made_again() -> None:
 def test_a_sound_recording_is_read_once_and_keeps_its_calibration() -> None:
     made: list[Mapping] = []
 
-    def make(read: Recording) -> Mapping:
+    def make(read: protocol.Recording) -> Mapping:
         made.append(Mapping(read))
         return made[-1]
 

@@ -17,8 +17,7 @@ from maplab_py.estimation.problem.gauge import clusters
 from maplab_py.estimation.symbolic.sources import PoseError
 from maplab_py.geometry import se3, so3
 from maplab_py.progress import SilentProgress
-from maplab_py.simulation.evaluation import evaluate_map
-from maplab_py.simulation.scenario_file import load_scenario
+from maplab_py.simulation import evaluation, scenario_file
 from maplab_py.simulation.simulate import simulate as simulate_scenario
 from maplab_py.vimap import Landmarks, LoopClosureEdges, random_ids, to_hex
 from tests.algorithms.relaxation.loops import Loop, ate, simulate
@@ -53,7 +52,7 @@ def test_thirty_percent_false_closures_cost_nothing(seed, drift):
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(s, marks=pytest.mark.slow) for s in (3, 7))])
 def test_false_edges_of_the_scenario(seed):
-    data = simulate_scenario(load_scenario("false_loop_edges").with_seed(seed))
+    data = simulate_scenario(scenario_file.load_scenario("false_loop_edges").with_seed(seed))
     vi_map, truth = data.maps[0], data.truth
     is_true = truth.loop_edge_is_true
     right = vi_map.loop_closure_edges.take(np.flatnonzero(is_true))
@@ -66,7 +65,7 @@ def test_false_edges_of_the_scenario(seed):
     switch = relaxed.loop_closure_edges.switch_variable  # edges stay and say what became of them
     assert switch[is_true].min() > 0.9
     assert switch[~is_true].max() < 0.1
-    assert evaluate_map(relaxed, truth).false_loop_edges_trusted == 0
+    assert evaluation.evaluate_map(relaxed, truth).false_loop_edges_trusted == 0
     assert report.num_switched_off == np.count_nonzero(~is_true)
     false = {to_hex(number) for number in vi_map.loop_closure_edges.id[~is_true]}
     assert len(report.worst) == 10

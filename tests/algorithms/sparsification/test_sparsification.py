@@ -18,9 +18,7 @@ from maplab_py.algorithms.sparsification.sparsify import (
     split,
 )
 from maplab_py.errors import FlagError, UserError
-from maplab_py.vimap import LandmarkQuality, VIMap, observer_counts
-from maplab_py.vimap.consistency import check_consistency
-from maplab_py.vimap.merge import merge_maps
+from maplab_py.vimap import LandmarkQuality, VIMap, consistency, merge, observer_counts
 from tests.algorithms.sparsification.instances import corridor
 from tests.simulation.small import simulated as small_data
 from tests.vimap.builders import walk_map
@@ -171,7 +169,7 @@ def test_exactly_so_many_good_landmarks_stay(simulated, method):
     result, report, coverage = sparsify(simulated, 150, SparsificationOptions(method=method))
     assert len(result.landmarks) == report.landmarks_after == 150
     assert np.all(result.landmarks.quality == LandmarkQuality.GOOD)
-    assert check_consistency(result).errors == ()
+    assert consistency.check_consistency(result).errors == ()
     assert len(result.keypoints) == len(simulated.keypoints)
     counted = np.bincount(
         result.keypoint_vertex[result.observations], minlength=len(result.vertices)
@@ -226,7 +224,7 @@ def test_deviation_is_the_mean_distance_from_the_majority():
 
 def test_landmarks_of_several_missions_score_higher():
     one = walk_map()
-    both, _ = merge_maps(one, walk_map(seed=1, first_ns=10**12))
+    both, _ = merge.merge_maps(one, walk_map(seed=1, first_ns=10**12))
     assert set(mission_counts(both)) <= {0, 1}
     shared = both.keypoints.landmark.copy()
     offset = len(one.landmarks)

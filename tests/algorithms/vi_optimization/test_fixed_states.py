@@ -18,8 +18,7 @@ from maplab_py.estimation.terms.pose import AbsolutePoseTerm, RelativePoseTerm
 from maplab_py.geometry import se3
 from maplab_py.progress import SILENT
 from maplab_py.sensors import Distortion, Projection
-from maplab_py.vimap import VIMap, ragged_rows
-from maplab_py.vimap.edits import remove_observations
+from maplab_py.vimap import VIMap, edits, ragged_rows
 from tests.support.dense import DenseProblem, dense_problem
 from tests.support.scene import Scene, corrupted
 
@@ -51,7 +50,7 @@ def without_edges(vi_map: VIMap, edges: list[int]) -> VIMap:
 
 def without_sight(vi_map: VIMap, vertices: list[int]) -> VIMap:
     seen = np.isin(vi_map.keypoint_vertex, vertices) & (vi_map.keypoints.landmark >= 0)
-    return remove_observations(vi_map, np.flatnonzero(seen))
+    return edits.remove_observations(vi_map, np.flatnonzero(seen))
 
 
 def apart(vi_map: VIMap) -> VIMap:
@@ -59,7 +58,7 @@ def apart(vi_map: VIMap) -> VIMap:
     own = vi_map.vertices.mission[vi_map.keypoint_vertex]
     landmark = vi_map.keypoints.landmark
     home = vi_map.vertices.mission[vi_map.landmarks.vertex[landmark]]
-    return remove_observations(vi_map, np.flatnonzero((landmark >= 0) & (own != home)))
+    return edits.remove_observations(vi_map, np.flatnonzero((landmark >= 0) & (own != home)))
 
 
 def only_shown(vi_map: VIMap) -> VIMap:
@@ -213,8 +212,8 @@ def test_vertex_that_sees_too_little_does_no_harm_to_others(left: int) -> None:
     vi_map = scene.make()
     options = dataclasses.replace(EXACT, include_inertial=False)
     seen = np.flatnonzero((vi_map.keypoint_vertex == 3) & (vi_map.keypoints.landmark >= 0))
-    poor, _ = optimize(remove_observations(vi_map, seen[left:]), options)
-    without, _ = optimize(remove_observations(vi_map, seen), options)
+    poor, _ = optimize(edits.remove_observations(vi_map, seen[left:]), options)
+    without, _ = optimize(edits.remove_observations(vi_map, seen), options)
     others = np.arange(6) != 3
     assert np.isfinite(poor.vertices.T_M_I).all()
     # the few pixels can be met by the poor vertex alone, at no cost for anybody else

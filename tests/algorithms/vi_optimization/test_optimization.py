@@ -13,11 +13,9 @@ from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import DataOptions, VIOptimizationOptions
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3
-from maplab_py.simulation.evaluation import evaluate_map
-from maplab_py.simulation.scenario_file import load_scenario
+from maplab_py.simulation import evaluation, scenario_file
 from maplab_py.simulation.simulate import SimulatedData, simulate
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.consistency import check_consistency
+from maplab_py.vimap import VIMap, consistency
 from maplab_py.vimap.edits import remove_observations
 from tests.simulation.small import simulated
 from tests.vimap.builders import walk_map
@@ -27,7 +25,7 @@ OPTIONS = VIOptimizationOptions()
 
 @cache
 def data() -> SimulatedData:
-    return simulate(load_scenario("three_sessions"))
+    return simulate(scenario_file.load_scenario("three_sessions"))
 
 
 def session() -> VIMap:
@@ -35,13 +33,13 @@ def session() -> VIMap:
 
 
 def test_errors_against_truth_fall() -> None:
-    before = evaluate_map(session(), data().truth)
+    before = evaluation.evaluate_map(session(), data().truth)
     result, report = optimize(session(), OPTIONS)
-    after = evaluate_map(result, data().truth)
+    after = evaluation.evaluate_map(result, data().truth)
     assert after.missions[0].ate_m <= 0.25 * before.missions[0].ate_m
     assert report.cost_after < report.cost_before
     assert sum(term.cost_after for term in report.terms) == pytest.approx(report.cost_after)
-    assert check_consistency(result).failure == ""
+    assert consistency.check_consistency(result).failure == ""
 
 
 def test_only_position_and_heading_of_one_vertex_are_fixed() -> None:

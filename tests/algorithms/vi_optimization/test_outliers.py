@@ -8,8 +8,7 @@ import pytest
 from maplab_py.algorithms.vi_optimization.data_selection import observations, select
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
-from maplab_py.vimap import LandmarkQuality, VIMap
-from maplab_py.vimap.edits import remove_observations
+from maplab_py.vimap import LandmarkQuality, VIMap, edits
 from tests.support.scene import Scene, corrupted
 
 OPTIONS = VIOptimizationOptions()
@@ -34,7 +33,7 @@ def position_error(result: VIMap, truth: VIMap) -> float:
 def test_outliers_do_no_harm_and_are_counted(offset_px: float) -> None:
     truth = SCENE.make()
     vi_map, bad = with_outliers(truth, 20, offset_px)
-    without, _ = optimize(remove_observations(truth, bad), TIGHT)
+    without, _ = optimize(edits.remove_observations(truth, bad), TIGHT)
     result, report = optimize(vi_map, TIGHT)
     left_out = report.observations_not_used + report.observations_rejected
     assert left_out == len(bad)
@@ -124,7 +123,7 @@ def test_observations_return_when_poses_have_improved() -> None:
 def test_landmark_left_with_one_observation_does_not_take_part() -> None:
     truth = SCENE.make()
     own = np.flatnonzero(truth.keypoints.landmark == 3)
-    alone = remove_observations(truth, own[1:])
+    alone = edits.remove_observations(truth, own[1:])
     result, report = optimize(alone, OPTIONS)
     assert report.observations_not_used >= 1
     assert report.landmarks == len(truth.landmarks) - 1

@@ -9,14 +9,12 @@ import pytest
 from maplab_py.algorithms.landmarks.sightings import rays_in_G, residuals
 from maplab_py.algorithms.self_calibration.calibration import calibrate
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
-from maplab_py.algorithms.vi_optimization.map_problem import build
-from maplab_py.algorithms.vi_optimization.optimization import optimize
+from maplab_py.algorithms.vi_optimization import map_problem, optimization
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.sensors import Camera, CameraRig
+from maplab_py.simulation import evaluation, truth
 from maplab_py.simulation import scenario as sim
-from maplab_py.simulation.evaluation import evaluate_map
 from maplab_py.simulation.simulate import SimulatedData, simulate
-from maplab_py.simulation.truth import true_map
 from maplab_py.storage.native import load_map, save_map
 from maplab_py.vimap import VIMap
 from tests.support.noiseless import without_noise
@@ -54,7 +52,7 @@ def exact() -> SimulatedData:
 
 def test_rows_are_seen_from_where_the_camera_was(exact: SimulatedData) -> None:
     """Triangulation and quality of landmarks take the time of each row into account."""
-    vi_map = true_map(exact.maps[0], exact.truth)
+    vi_map = truth.true_map(exact.maps[0], exact.truth)
     keypoints = vi_map.observations
     p_G = vi_map.p_G[vi_map.keypoints.landmark[keypoints]]
     still = with_timing(vi_map, image_delay_s=0.0, line_delay_ns=0)
@@ -71,15 +69,15 @@ def test_rows_are_seen_from_where_the_camera_was(exact: SimulatedData) -> None:
 
 
 def test_known_line_delays_need_no_other_kernels(exact: SimulatedData) -> None:
-    vi_map = true_map(exact.maps[0], exact.truth)
+    vi_map = truth.true_map(exact.maps[0], exact.truth)
     options = VIOptimizationOptions(include_inertial=False)
-    problem = build(vi_map, options)
+    problem = map_problem.build(vi_map, options)
     visual = problem.problem.visual
     assert visual is not None
     assert not visual.estimates_cameras
     assert visual.refresh(problem.states)
     assert np.median(visual.errors(problem.states)[0]) < 0.05
-    still = build(with_timing(vi_map, image_delay_s=0.0, line_delay_ns=0), options)
+    still = map_problem.build(with_timing(vi_map, image_delay_s=0.0, line_delay_ns=0), options)
     assert still.problem.visual is not None
     assert not still.problem.visual.refresh(still.states)
     assert np.median(still.problem.visual.errors(still.states)[0]) > 1.0
@@ -102,9 +100,9 @@ OPTIONS = VIOptimizationOptions(num_iterations=60, calibration="fixed")
 
 def ate_m(start: VIMap, data: SimulatedData, **free: bool) -> tuple[float, Camera]:
     """Return the absolute trajectory error of the optimised map, and its camera."""
-    result, report = optimize(start, dataclasses.replace(OPTIONS, **free))
+    result, report = optimization.optimize(start, dataclasses.replace(OPTIONS, **free))
     assert all(row.sigma > 0.0 for row in report.calibration)
-    return evaluate_map(result, data.truth).ate_m, camera_of(result)
+    return evaluation.evaluate_map(result, data.truth).ate_m, camera_of(result)
 
 
 @pytest.mark.slow

@@ -8,12 +8,10 @@ from numpy.typing import NDArray
 
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
-from maplab_py.estimation.imu.inertial_data import InertialData
-from maplab_py.estimation.imu.preintegration import propagate
+from maplab_py.estimation.imu import inertial_data, preintegration
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import CameraRig, Distortion, ImuIntrinsics, Projection
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.consistency import check_consistency
+from maplab_py.vimap import VIMap, consistency
 from tests.support.scene import EVERY_MODEL, Scene, aligned, corrupted
 
 EXACT = VIOptimizationOptions(
@@ -61,11 +59,11 @@ def disturbed(vi_map: VIMap, seed: int = 7) -> VIMap:
 @pytest.mark.parametrize("name", SCENES)
 def test_samples_fit_the_discrete_integration(name: str) -> None:
     truth = SCENES[name].make()
-    assert check_consistency(truth).failure == ""
-    data, edges = InertialData.of_map(truth), truth.imu_edges
+    assert consistency.check_consistency(truth).failure == ""
+    data, edges = inertial_data.InertialData.of_map(truth), truth.imu_edges
     v_G = so3.rotate(truth.T_G_M[truth.vertices.mission, :4], truth.vertices.v_M)
     first = edges.from_vertex
-    poses, velocities = propagate(
+    poses, velocities = preintegration.propagate(
         data,
         truth.T_G_I[first],
         v_G[first],

@@ -12,9 +12,8 @@ from maplab_py.estimation.terms.inertial import SPEEDED_MPS, TURNED_RAD
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Imu, ImuIntrinsics
 from tests.estimation.imu.motion import GRAVITY, one_edge, sampled, truth
+from tests.support import imu_model, machine
 from tests.support.data import shared_data
-from tests.support.imu_model import distort_imu
-from tests.support.machine import slowness
 
 ZERO = np.zeros(3)
 INTRINSICS = ImuIntrinsics(
@@ -154,7 +153,7 @@ def test_two_edges_compose_to_the_long_one():
 def test_intrinsics_and_biases_are_taken_off():
     stamps, readings = sampled(1.0, 200)
     b_g, b_a = np.array([0.02, -0.01, 0.03]), np.array([0.1, 0.2, -0.05])
-    measured = distort_imu(INTRINSICS, readings, b_a, b_g)
+    measured = imu_model.distort_imu(INTRINSICS, readings, b_a, b_g)
     imu = Imu("0" * 32, intrinsics=INTRINSICS)
     ideal = integrate(one_edge(stamps, readings), ZERO, ZERO)
     edge = integrate(one_edge(stamps, measured, imu), b_g, b_a)
@@ -209,7 +208,7 @@ def test_speed_and_bits_do_not_depend_on_threads():
         best = min(best, time.perf_counter() - begin)
         results.append(edge.covariance.tobytes() + edge.dp.tobytes() + edge.q_A_B.tobytes())
     assert results[0] == results[1] == results[2]
-    assert best < 0.3 * slowness()  # 25,000 samples; a tenth of it on an idle machine
+    assert best < 0.3 * machine.slowness()  # 25,000 samples; a tenth of it on an idle machine
 
 
 def test_last_state_is_what_the_preintegrated_edge_predicts():

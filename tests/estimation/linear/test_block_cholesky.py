@@ -8,12 +8,9 @@ from hypothesis import strategies as st
 from threadpoolctl import threadpool_info
 
 from benchmarks.solution import effort
+from maplab_py.estimation.linear import ordering, protocol, supernodal, supernodal_solver
 from maplab_py.estimation.linear.block_cholesky import BlockCholesky
-from maplab_py.estimation.linear.ordering import AUTOMATIC, indistinguishable_nodes, minimum_degree
 from maplab_py.estimation.linear.pattern import BlockPattern, upper_columns
-from maplab_py.estimation.linear.protocol import NotPositiveDefinite
-from maplab_py.estimation.linear.supernodal import SCRATCH_SIZE
-from maplab_py.estimation.linear.supernodal_solver import SupernodalCholesky
 from maplab_py.estimation.linear.symbolic import analyse, postorder
 from maplab_py.estimation.linear.threads import single_blas_thread, single_thread
 from tests.estimation.linear.systems import STRUCTURES, system
@@ -55,7 +52,7 @@ def test_fronts_hold_the_factor_and_few_zeros_more(name):
 def test_minimum_degree_makes_no_needless_fill(name):
     rows, cols, n, _, _ = system(name, 1, seed=7)
     pattern = BlockPattern.checked(rows, cols, n, 1)
-    fill = _dense_fill(pattern, minimum_degree(pattern)).sum()
+    fill = _dense_fill(pattern, ordering.minimum_degree(pattern)).sum()
     tree_entries = 2 * n - 1
     assert fill <= tree_entries + (n if name == "ring" else 0)
 
@@ -75,7 +72,7 @@ def test_nodes_with_equal_neighbourhoods_are_one_group():
     rows, cols = np.array([1, 2, 2, 3, 3]), np.array([0, 0, 1, 2, 2])
     pattern = BlockPattern.checked(rows, cols, 5, 1)
     start, upper = upper_columns(pattern.rows, pattern.cols, np.arange(5))
-    group, count = indistinguishable_nodes(start, upper)
+    group, count = ordering.indistinguishable_nodes(start, upper)
     assert count == 4
     assert group[0] == group[1]
     assert len({group[0], group[2], group[3], group[4]}) == 4
@@ -121,7 +118,7 @@ def test_indefinite_matrix_is_refused_and_the_solver_lives_on(name):
     bad = values.copy()
     victim = n // 2
     bad[(rows == victim) & (cols == victim), 1, 1] = -1e6
-    with pytest.raises(NotPositiveDefinite) as caught:
+    with pytest.raises(protocol.NotPositiveDefinite) as caught:
         solver.factor(bad)
     # the node is the bad one, or an ancestor that its pivot made bad
     assert 0 <= caught.value.node < n
@@ -139,7 +136,7 @@ def test_a_node_without_information_and_one_that_is_not_a_number_are_named():
         bad = values.copy()
         bad[rows == 4] = bad_value
         solver = BlockCholesky(rows, cols, n, 2)
-        with pytest.raises(NotPositiveDefinite) as caught:
+        with pytest.raises(protocol.NotPositiveDefinite) as caught:
             solver.factor(bad)
         assert caught.value.node == 4
 
@@ -240,10 +237,10 @@ def test_wide_fronts_are_cut_and_solved() -> None:
     """Every way of an update: whole and scattered, in tiles, and straight into the panel."""
     rows, cols, n = arrow(branches=4, length=3, trunk=400)
     pattern = BlockPattern.checked(rows, cols, n, D)
-    plan = analyse(pattern, AUTOMATIC).plan
+    plan = analyse(pattern, ordering.AUTOMATIC).plan
     width = np.diff(plan.first_node) * D
     assert width.max() <= 256
-    assert (np.diff(plan.below_start).max() * D) ** 2 > SCRATCH_SIZE
+    assert (np.diff(plan.below_start).max() * D) ** 2 > supernodal.SCRATCH_SIZE
     values, dense = random_system(rows, cols, n)
     solver = BlockCholesky(rows, cols, n, D)
     solver.factor(values)
@@ -267,7 +264,7 @@ def test_hardly_anything_is_stored_above_the_diagonal() -> None:
 def test_blocks_come_back_as_they_were_summed(name: str) -> None:
     rows, cols, n, values, dense = system(name, D, seed=1)
     rows, cols = rows.astype(np.int32), cols.astype(np.int32)
-    solver = SupernodalCholesky(rows, cols, n, D)
+    solver = supernodal_solver.SupernodalCholesky(rows, cols, n, D)
     places = solver.places(rows, cols)
     solver.clear()
     solver.add(rows, cols, places, values)
@@ -291,7 +288,7 @@ def test_projection_and_damping_are_those_of_dense_algebra() -> None:
     projector[fixed] = 0.0
     added, size = rng.uniform(0.1, 1.0, (n, D)), rng.uniform(1.0, 2.0, n)
     rows, cols = rows.astype(np.int32), cols.astype(np.int32)
-    solver = SupernodalCholesky(rows, cols, n, D)
+    solver = supernodal_solver.SupernodalCholesky(rows, cols, n, D)
     solver.clear()
     solver.add(rows, cols, solver.places(rows, cols), values)
     solver.add_to_diagonal(added)
@@ -308,7 +305,7 @@ def test_projection_and_damping_are_those_of_dense_algebra() -> None:
 
 def test_a_factor_that_is_gone_is_not_used() -> None:
     node = np.zeros(1, dtype=np.int32)
-    solver = SupernodalCholesky(node, node, 1, D)
+    solver = supernodal_solver.SupernodalCholesky(node, node, 1, D)
     solver.clear()
     solver.add_to_diagonal(np.full((1, D), 2.0))
     solver.factorise()
@@ -329,7 +326,7 @@ def test_memory_grows_by_little_more_than_the_factor() -> None:
         np.eye(D) * np.array([2.0, 1.0, 2.0])[:, None, None]
     )
     with effort() as spent:
-        solver = SupernodalCholesky(rows, cols, n, D)
+        solver = supernodal_solver.SupernodalCholesky(rows, cols, n, D)
         places = solver.places(rows, cols)
         solver.clear()
         solver.add(rows, cols, places, values)

@@ -9,7 +9,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from maplab_py.array_types import F64
 from maplab_py.errors import FlagError
-from maplab_py.estimation.linear import nested_dissection, ordering
+from maplab_py.estimation.linear import nested_dissection, ordering, protocol, quotient_graph
 from maplab_py.estimation.linear.conjugate_gradients import (
     CGResult,
     Operator,
@@ -23,8 +23,6 @@ from maplab_py.estimation.linear.ordering import (
     minimum_degree_of_groups,
 )
 from maplab_py.estimation.linear.pattern import BlockPattern
-from maplab_py.estimation.linear.protocol import NotPositiveDefinite
-from maplab_py.estimation.linear.quotient_graph import QuotientGraph
 from maplab_py.estimation.linear.symbolic import analyse
 from tests.estimation.linear.systems import STRUCTURES, system
 from tests.support.data import REPOSITORY
@@ -59,12 +57,12 @@ def _sessions_on_a_loop(sessions: int, keyframes: int) -> tuple[BlockPattern, np
     return BlockPattern.checked(rows, cols, 5 * len(along_m), 3), np.repeat(circle, 5, axis=0)
 
 
-def _without_groups(pattern: BlockPattern) -> QuotientGraph:
+def _without_groups(pattern: BlockPattern) -> quotient_graph.QuotientGraph:
     """Make every node of a pattern a group."""
     n = pattern.num_nodes
     off_diagonal = pattern.rows != pattern.cols
     key = np.unique(pattern.rows[off_diagonal].astype(np.int64) * n + pattern.cols[off_diagonal])
-    return QuotientGraph(np.arange(n), np.ones(n, dtype=np.int64), key // n, key % n)
+    return quotient_graph.QuotientGraph(np.arange(n), np.ones(n, dtype=np.int64), key // n, key % n)
 
 
 def _dense_columns(pattern: BlockPattern, order: np.ndarray) -> np.ndarray:
@@ -104,7 +102,7 @@ def test_predicted_work_is_that_of_a_dense_elimination(name: str) -> None:
 
 def test_work_of_groups_is_that_of_their_nodes() -> None:
     pattern, _ = _sessions_on_a_loop(2, 40)
-    graph, single = QuotientGraph.of(pattern), _without_groups(pattern)
+    graph, single = quotient_graph.QuotientGraph.of(pattern), _without_groups(pattern)
     assert len(graph) < len(single)
     order = minimum_degree_of_groups(graph)
     # a group's triangle: its columns one by one have the same entries
@@ -113,7 +111,7 @@ def test_work_of_groups_is_that_of_their_nodes() -> None:
 
 
 def test_the_adjacency_has_no_diagonal_and_no_duplicates() -> None:
-    graph = QuotientGraph.of(_pattern("random"))
+    graph = quotient_graph.QuotientGraph.of(_pattern("random"))
     start, neighbours = graph.adjacency()
     edges = {
         (row, int(col))
@@ -161,7 +159,7 @@ def test_cuts_separate_and_nodes_without_position_come_last(
 
 
 def test_small_systems_ask_for_a_single_order(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(graph: QuotientGraph) -> None:
+    def refuse(graph: quotient_graph.QuotientGraph) -> None:
         raise AssertionError("a second order costs more than it saves")
 
     monkeypatch.setattr(ordering, "dissect_by_metis", refuse)
@@ -281,7 +279,7 @@ def test_nothing_to_do_takes_no_iteration() -> None:
 @pytest.mark.parametrize("entry", [-1.0, np.nan])
 def test_what_is_not_positive_definite_is_refused(entry: float) -> None:
     matrix = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, entry])
-    with pytest.raises(NotPositiveDefinite) as error:
+    with pytest.raises(protocol.NotPositiveDefinite) as error:
         conjugate_gradients(
             product_with(matrix), lambda r: r, np.eye(2, 3, 2) + np.eye(2, 3, 1),
             forcing=1e-9, max_iterations=10,

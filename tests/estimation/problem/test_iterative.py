@@ -21,9 +21,8 @@ from maplab_py.estimation.problem.problem import Problem
 from maplab_py.estimation.problem.solver import SolverOptions, optimize_states
 from maplab_py.estimation.states import NODES_PER_VERTEX, POSITION, States, pose_nodes
 from maplab_py.estimation.symbolic.sources import relative_pose
+from maplab_py.estimation.terms import pose, protocol
 from maplab_py.estimation.terms.cameras import Cameras, camera_blocks
-from maplab_py.estimation.terms.pose import RelativePoseTerm, whitening
-from maplab_py.estimation.terms.protocol import FactorTerm
 from maplab_py.estimation.terms.visual import Observations, VisualTerms
 from maplab_py.geometry import se3
 from maplab_py.memory import NotEnoughMemory
@@ -44,7 +43,7 @@ def poses(seed: int = 0) -> States:
     return States(T_G_I, zero, zero, zero, np.zeros((0, 3)))
 
 
-def edges(states: States, name: str, pairs: I64) -> RelativePoseTerm:
+def edges(states: States, name: str, pairs: I64) -> pose.RelativePoseTerm:
     """Return measured relative poses that differ from those of the states."""
     first, second = pairs.T
     rng = np.random.default_rng(1)
@@ -52,9 +51,9 @@ def edges(states: States, name: str, pairs: I64) -> RelativePoseTerm:
     measured = se3.retract(
         se3.relative(T[first], T[second]), 0.1 * rng.normal(size=(len(pairs), 6))
     )
-    return RelativePoseTerm(
+    return pose.RelativePoseTerm(
         residual_kernel("relative_pose", relative_pose), name, first, second,
-        se3.identity(len(pairs)), measured, whitening(np.tile(1e-2 * np.eye(6), (len(pairs), 1, 1))),
+        se3.identity(len(pairs)), measured, pose.whitening(np.tile(1e-2 * np.eye(6), (len(pairs), 1, 1))),
     )  # fmt: skip
 
 
@@ -118,15 +117,15 @@ def problem_of(seed: int = 1, **options: object) -> DenseProblem:
     return dense_problem(disturbed, **inner)  # type: ignore[arg-type]
 
 
-def loop_edges(dense: DenseProblem) -> FactorTerm:
+def loop_edges(dense: DenseProblem) -> protocol.FactorTerm:
     """Return edges between vertices far apart, against their rows' order too."""
     T = dense.states.T_G_I
     first, second = np.array([0, len(T) - 1, 3]), np.array([len(T) - 2, 1, 4])
     off = se3.exp(0.01 * np.arange(1.0, 7.0))
-    return RelativePoseTerm(
+    return pose.RelativePoseTerm(
         residual_kernel("relative_pose", relative_pose), "loop closure", first, second,
         se3.identity(3), se3.compose(se3.relative(T[first], T[second]), off),
-        whitening(np.tile(np.eye(6) * 1e-4, (3, 1, 1))), loss=(Loss.CAUCHY, 1.0),
+        pose.whitening(np.tile(np.eye(6) * 1e-4, (3, 1, 1))), loss=(Loss.CAUCHY, 1.0),
     )  # fmt: skip
 
 

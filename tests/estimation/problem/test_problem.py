@@ -14,8 +14,7 @@ from maplab_py.estimation.problem.trust_region import Schedule, StepJudge, Trust
 from maplab_py.estimation.states import NODES_PER_VERTEX, ORIENTATION, POSITION
 from maplab_py.estimation.symbolic.sources import absolute_pose, relative_pose
 from maplab_py.estimation.terms import factor as factor_terms
-from maplab_py.estimation.terms.pose import AbsolutePoseTerm, RelativePoseTerm, whitening
-from maplab_py.estimation.terms.protocol import FactorTerm
+from maplab_py.estimation.terms import pose, protocol
 from maplab_py.geometry import se3, so3
 from maplab_py.progress import SILENT
 from maplab_py.sensors import Distortion, Projection
@@ -45,18 +44,18 @@ def small(**options: object) -> VIMap:
     return disturbed(Scene(vertices=4, landmarks=20, seen_share=0.8, **options))  # type: ignore[arg-type]
 
 
-def pose_terms(dense: DenseProblem) -> list[FactorTerm]:
+def pose_terms(dense: DenseProblem) -> list[protocol.FactorTerm]:
     """Return a relative term whose ends are against the rows' order, and an absolute one."""
     T_I_S = se3.make(so3.exp([[0.2, 0.1, -0.4]]), [[0.1, 0.2, -0.1]])
     T_G_S = se3.compose(dense.states.T_G_I, T_I_S)
     off = se3.exp(0.05 * np.arange(1.0, 7.0))
     spread = np.random.default_rng(2).normal(size=(6, 6))
-    W = whitening((spread @ spread.T + np.eye(6))[None] * 1e-3)
+    W = pose.whitening((spread @ spread.T + np.eye(6))[None] * 1e-3)
     first, second = np.array([2, 0]), np.array([1, 3])
     measured = se3.compose(se3.relative(T_G_S[first], T_G_S[second]), off)
     vertex = np.array([1])
     return [
-        RelativePoseTerm(
+        pose.RelativePoseTerm(
             residual_kernel("relative_pose", relative_pose),
             "odometry",
             first,
@@ -65,7 +64,7 @@ def pose_terms(dense: DenseProblem) -> list[FactorTerm]:
             measured,
             np.repeat(W, 2, axis=0),
         ),
-        AbsolutePoseTerm(
+        pose.AbsolutePoseTerm(
             residual_kernel("absolute_pose", absolute_pose),
             vertex,
             T_I_S,
@@ -221,7 +220,7 @@ def test_however_heavy_the_damping_the_system_can_be_solved(damping: float) -> N
 def test_robust_gradient_is_that_of_the_cost(loss: Loss) -> None:
     dense = dense_problem(small(), loss=loss, loss_scale=1.3, include_inertial=False)
     T_I_S = np.broadcast_to(se3.identity(), (1, 7))
-    term = AbsolutePoseTerm(
+    term = pose.AbsolutePoseTerm(
         residual_kernel("absolute_pose", absolute_pose),
         np.array([1]),
         T_I_S,

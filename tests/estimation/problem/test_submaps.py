@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from maplab_py.errors import EstimationError
+from maplab_py.estimation.linear import protocol, submap_solver
 from maplab_py.estimation.linear.ordering import Ordering, OrderingKind
 from maplab_py.estimation.linear.pattern import BlockPattern
-from maplab_py.estimation.linear.protocol import NotPositiveDefinite
-from maplab_py.estimation.linear.submap_solver import cut_into_submaps
 from maplab_py.estimation.linear.symbolic import analyse
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.problem.marginals import Marginals
@@ -127,7 +126,7 @@ def test_singular_equations_are_told_when_the_step_is_asked_for() -> None:
     dense = long_problem(include_inertial=False)
     split = SubmapProblem(dense.states, dense.visual, dense.factors, 3)
     linear = split.linearize(dense.states, 0.0)
-    with pytest.raises(NotPositiveDefinite):
+    with pytest.raises(protocol.NotPositiveDefinite):
         split.solve(linear, -2.0)
 
 
@@ -176,7 +175,7 @@ def test_submaps_share_no_block_and_the_factor_is_the_same(kind: OrderingKind, c
     pattern = BlockPattern.checked(*far, n, 3)
     position_m = np.column_stack([np.arange(n), np.zeros(n), np.zeros(n)]).astype(float)
     symbolic = analyse(pattern, Ordering(kind, position_m))
-    submaps = cut_into_submaps(symbolic, count)
+    submaps = submap_solver.cut_into_submaps(symbolic, count)
     assert 1 <= sum(submaps.is_submap) <= count
     part = submaps.part_of_nodes()
     for a, b in np.unique(np.column_stack([part[pattern.rows], part[pattern.cols]]), axis=0):

@@ -6,16 +6,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from maplab_py.estimation.blocks import Manifold, ParameterBlock
+from maplab_py.estimation import blocks, loss
 from maplab_py.estimation.codegen.kernels import residual_kernel, visual_kernels
 from maplab_py.estimation.imu.inertial_data import InertialData
-from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.problem.problem import Problem
 from maplab_py.estimation.states import ACCEL_BIAS, GYRO_BIAS, VELOCITY, States
 from maplab_py.estimation.symbolic import sources
 from maplab_py.estimation.symbolic.sources import absolute_pose, inertial, relative_pose
+from maplab_py.estimation.terms import inertial_calibration, protocol, wheel
 from maplab_py.estimation.terms.cameras import Cameras, camera_blocks
-from maplab_py.estimation.terms.inertial_calibration import CalibratingInertialTerm, imu_blocks
 from maplab_py.estimation.terms.pose import (
     SWITCH,
     AbsolutePoseTerm,
@@ -26,16 +25,9 @@ from maplab_py.estimation.terms.pose import (
     switch_block,
 )
 from maplab_py.estimation.terms.prior import BlockPrior, PosePrior, VertexVectorPrior
-from maplab_py.estimation.terms.protocol import FactorTerm
 from maplab_py.estimation.terms.visual import Observations, VisualTerms
-from maplab_py.estimation.terms.wheel import (
-    WHEEL_SCALE,
-    ScaledRelativePoseTerm,
-    wheel_scale_block,
-)
 from maplab_py.geometry import se3, so3
-from maplab_py.sensors import Distortion, Imu, Projection
-from maplab_py.sensors.camera import DISTORTION_SIZE, INTRINSICS_SIZE
+from maplab_py.sensors import Distortion, Imu, Projection, camera
 from maplab_py.sensors.imu import ImuIntrinsics
 from tests.estimation.dense import (
     assert_relative,
@@ -95,7 +87,7 @@ def make_scene(models: tuple[tuple[Projection, Distortion], ...], *, line_delays
         loss_scale=np.full(count, np.sqrt(SCALE2)),
     )
     visual = VisualTerms(
-        visual_kernels(), observations, cameras, VERTICES, loss=Loss.CAUCHY, estimate_cameras=True,
+        visual_kernels(), observations, cameras, VERTICES, loss=loss.Loss.CAUCHY, estimate_cameras=True,
         estimate_line_delays=line_delays,
     )  # fmt: skip
     points = rng.uniform([-1, -1, 3], [1, 1, 5], (LANDMARKS, 3))
@@ -181,7 +173,7 @@ def test_padding_of_narrow_cameras_has_no_effect(scene: Scene) -> None:
     intrinsics = scene.states.nodes("camera intrinsics")
     diagonal = linear.diagonal[intrinsics].reshape(len(intrinsics), -1)
     for row, (projection, distortion) in enumerate(scene.models):
-        size = INTRINSICS_SIZE[projection] + DISTORTION_SIZE[distortion]
+        size = camera.INTRINSICS_SIZE[projection] + camera.DISTORTION_SIZE[distortion]
         assert diagonal[row, :size].all()
         assert not diagonal[row, size:].any()
     offset = scene.states.nodes("camera timing").reshape(-1)
@@ -213,7 +205,7 @@ def test_known_delays_move_measurements_of_any_kernels(scene: Scene) -> None:
         [make_camera(*model) for model in scene.models],
         scene.states.blocks["camera extrinsics"].values,
     )
-    plain = VisualTerms(visual_kernels(), measured, cameras, VERTICES, loss=Loss.CAUCHY)
+    plain = VisualTerms(visual_kernels(), measured, cameras, VERTICES, loss=loss.Loss.CAUCHY)
     velocity = rng.normal(0, 1, (VERTICES, 3))
     plain.follow_motion(velocity, delay_s)
     assert plain.refresh(scene.states)
@@ -222,7 +214,7 @@ def test_known_delays_move_measurements_of_any_kernels(scene: Scene) -> None:
     np.testing.assert_allclose(
         plain.errors(scene.states)[0], scene.visual.errors(scene.states)[0], rtol=1e-12
     )
-    without = VisualTerms(visual_kernels(), measured, cameras, VERTICES, loss=Loss.CAUCHY)
+    without = VisualTerms(visual_kernels(), measured, cameras, VERTICES, loss=loss.Loss.CAUCHY)
     assert not without.refresh(scene.states)
     assert np.abs(without.errors(scene.states)[0] - plain.errors(scene.states)[0]).max() > 0.1
 
@@ -240,7 +232,9 @@ def states(rng: np.random.Generator, vertices: int = 3) -> States:
     return States(poses, vectors(1.0), vectors(0.01), vectors(0.1), np.zeros((0, 3)))
 
 
-def check(term: FactorTerm, at: States, step: float = 1e-6, tolerance: float = 1e-6) -> None:
+def check(
+    term: protocol.FactorTerm, at: States, step: float = 1e-6, tolerance: float = 1e-6
+) -> None:
     found = term_jacobian(term, at)
     wanted = numeric_jacobian(lambda moved: term.evaluate(moved)[0], at, step)
     np.testing.assert_allclose(found, wanted, atol=tolerance * np.abs(wanted).max())
@@ -258,11 +252,11 @@ def test_inertial_edges_with_imu_intrinsics(rng: np.random.Generator, angle: flo
     data = InertialData(
         np.array([0, 31, 61]), stamps, readings, (imu,), np.zeros(2, dtype=np.int64)
     )
-    at = states(rng).with_blocks(*imu_blocks((imu,)))
+    at = states(rng).with_blocks(*inertial_calibration.imu_blocks((imu,)))
     kernel = residual_kernel("inertial_with_intrinsics", sources.inertial_with_intrinsics)
     first, second = np.array([0, 1]), np.array([1, 2])
     gravity = np.tile([0.0, 0.0, -9.81], (2, 1))
-    term = CalibratingInertialTerm(kernel, data, first, second, gravity, at)
+    term = inertial_calibration.CalibratingInertialTerm(kernel, data, first, second, gravity, at)
     term.relinearize(at)
     check(term, at)
 
@@ -284,7 +278,9 @@ def test_poses_of_mounted_sensors(rng: np.random.Generator, angle: float) -> Non
 @pytest.mark.parametrize("has_mounting", [False, True])
 def test_wheels_of_unknown_scale(rng: np.random.Generator, has_mounting: bool) -> None:
     T_I_S = se3.make(so3.exp(rng.normal(size=(2, 3))), rng.normal(size=(2, 3)))
-    at = states(rng).with_blocks(mounting_block(T_I_S), wheel_scale_block(np.array([1.02, 0.9])))
+    at = states(rng).with_blocks(
+        mounting_block(T_I_S), wheel.wheel_scale_block(np.array([1.02, 0.9]))
+    )
     W = rng.normal(size=(2, 6, 6))
     measured = se3.make(so3.exp(rng.normal(size=(2, 3))), rng.normal(size=(2, 3)))
     name = "scaled_relative_pose" + ("_with_mounting" if has_mounting else "")
@@ -293,7 +289,7 @@ def test_wheels_of_unknown_scale(rng: np.random.Generator, has_mounting: bool) -
     ends = np.array([0, 1]), np.array([1, 2])
     poses = RelativePoseTerm(kernel, "wheels", *ends, T_I_S, measured, W, mounting=mounting)
     sensor = np.array([1, 0])
-    check(ScaledRelativePoseTerm(poses, sensor, at.nodes(WHEEL_SCALE)[sensor]), at)
+    check(wheel.ScaledRelativePoseTerm(poses, sensor, at.nodes(wheel.WHEEL_SCALE)[sensor]), at)
 
 
 def test_switched_relative_poses(rng: np.random.Generator) -> None:
@@ -323,15 +319,15 @@ def test_an_open_switch_is_the_relative_pose_itself(rng: np.random.Generator) ->
     np.testing.assert_allclose(switched.evaluate(at)[0], plain.evaluate(at)[0], atol=1e-12)
 
 
-@pytest.mark.parametrize("manifold", list(Manifold))
-def test_priors_of_blocks(rng: np.random.Generator, manifold: Manifold) -> None:
+@pytest.mark.parametrize("manifold", list(blocks.Manifold))
+def test_priors_of_blocks(rng: np.random.Generator, manifold: blocks.Manifold) -> None:
     tangent = rng.normal(0, 0.8, (3, 6))
     values = {
-        Manifold.VECTOR: tangent[:, :4],
-        Manifold.POSE: se3.make(so3.exp(tangent[:, 3:]), tangent[:, :3]),
-        Manifold.ROTATION: so3.exp(tangent[:, :3]),
+        blocks.Manifold.VECTOR: tangent[:, :4],
+        blocks.Manifold.POSE: se3.make(so3.exp(tangent[:, 3:]), tangent[:, :3]),
+        blocks.Manifold.ROTATION: so3.exp(tangent[:, :3]),
     }[manifold]
-    at = states(rng).with_blocks(ParameterBlock("thing", values, manifold))
+    at = states(rng).with_blocks(blocks.ParameterBlock("thing", values, manifold))
     size = at.blocks["thing"].dimension
     reference = at.blocks["thing"].moved(rng.normal(0, 0.5, (at.blocks["thing"].num_nodes, 3)))
     root = rng.normal(size=(2, size, size))

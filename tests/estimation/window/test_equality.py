@@ -17,11 +17,10 @@ from maplab_py.estimation.terms.cameras import Cameras
 from maplab_py.estimation.terms.inertial import BiasWalkTerm, InertialTerm
 from maplab_py.estimation.terms.prior import PosePrior, VertexVectorPrior
 from maplab_py.estimation.terms.visual import Observations, VisualTerms
-from maplab_py.estimation.window.calibration import WindowCalibration
+from maplab_py.estimation.window import calibration, inertial
 from maplab_py.estimation.window.cameras import CameraPoses
 from maplab_py.estimation.window.factors import FrameFactors, Standstill
 from maplab_py.estimation.window.frame import StartState
-from maplab_py.estimation.window.inertial import InertialChain
 from maplab_py.estimation.window.options import WindowOptions
 from maplab_py.estimation.window.prior import WindowPrior
 from maplab_py.estimation.window.problem import WindowProblem
@@ -107,8 +106,8 @@ def window_problem(
 ) -> WindowProblem:
     """State the smoother's window at other states, inertial edges integrated there."""
     data, _ = smoother.tracks.data(smoother.tracks.landmark_rows, smoother.options.huber_sigmas)
-    cameras = WindowCalibration.of(tracks.cameras, tracks.T_I_C)
-    chain = InertialChain(residual_kernel("inertial", sources.inertial), tracks.imu)
+    cameras = calibration.WindowCalibration.of(tracks.cameras, tracks.T_I_C)
+    chain = inertial.InertialChain(residual_kernel("inertial", sources.inertial), tracks.imu)
     for frame, motion in zip(tracks.frames[1:], window.motion[:-1], strict=False):
         chain.append(frame.imu_times_ns, frame.accel_gyro, motion, is_resting=False)
     still = residual_kernel("relative_pose", sources.relative_pose)

@@ -9,11 +9,10 @@ from maplab_py.array_types import F64
 from maplab_py.estimation.codegen.kernels import window_kernels
 from maplab_py.estimation.kernels import map_observations as kernels
 from maplab_py.estimation.kernels.window_arguments import DenseSystem
+from maplab_py.estimation.window import localized, warmup
 from maplab_py.estimation.window.alignment import AlignmentProblem, aligned
-from maplab_py.estimation.window.localized import composition_jacobian
 from maplab_py.estimation.window.map_terms import MapObservations, MapTerms
 from maplab_py.estimation.window.states import WindowStates
-from maplab_py.estimation.window.warmup import window_jobs
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Camera, Distortion, Projection
 from maplab_py.sensors.projection import project
@@ -249,7 +248,7 @@ def test_residuals_are_those_of_the_camera_models() -> None:
 
 
 def test_the_warmup_compiles_what_terms_evaluate() -> None:
-    jobs = window_jobs()
+    jobs = warmup.window_jobs()
     jobs["window landmarks"]()
     jobs["window"]()
     by_hand = (kernels.weigh, kernels.sum_observations, kernels.add_square)
@@ -275,7 +274,7 @@ def test_equations_of_the_base_frame_are_those_of_the_whole_system() -> None:
 
 def test_composition_jacobian_is_that_of_differences() -> None:
     T_M_I = se3.make(so3.exp([0.4, -0.2, 1.0]), [1.0, 2.0, -0.5])
-    J = composition_jacobian(T_G_M, T_M_I)
+    J = localized.composition_jacobian(T_G_M, T_M_I)
     T_G_I = se3.compose(T_G_M, T_M_I)
     for k in range(12):
         d = np.zeros(12)

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from maplab_py.interop.ply import PlyCloud, encode_ply
-from maplab_py.interop.recordings.bag_files import opened_bag
-from maplab_py.interop.recordings.bag_writing import BagFormat
+from maplab_py.interop.recordings import bag_files, bag_writing
 from maplab_py.interop.resources.depth_maps import RAW_DEPTH_MAPS, encoded_depth
 from maplab_py.interop.resources.point_clouds import XYZ, XYZI, XYZRGB
 from maplab_py.sensors import CameraRig, Distortion
@@ -16,11 +15,11 @@ from maplab_py.storage.resources.new import NewResources
 from maplab_py.vimap import ResourceOwner, VIMap, from_hex
 from tests.interop.small_map import CAMERA_ID, IMU_ID, RIG_ID, VERTICES, make_map
 
-FORMATS = list(BagFormat)
+FORMATS = list(bag_writing.BagFormat)
 OFFSET_NS = 2_500_000
 
 
-def named(folder: Path, kind: BagFormat, name: str = "walk") -> Path:
+def named(folder: Path, kind: bag_writing.BagFormat, name: str = "walk") -> Path:
     return folder / (name if kind.is_ros_2 else f"{name}.bag")
 
 
@@ -82,7 +81,7 @@ def with_camera(vi_map: VIMap, **changes: Any) -> VIMap:
 def messages_of(path: Path) -> dict[str, list[tuple[int, Any]]]:
     """Return arrivals and messages of each topic, read with rosbags."""
     read: dict[str, list[tuple[int, Any]]] = {}
-    with opened_bag(path) as reader:
+    with bag_files.opened_bag(path) as reader:
         for connection, time_ns, data in reader.messages():
             message = reader.deserialize(data, connection.msgtype)
             read.setdefault(connection.topic, []).append((time_ns, message))

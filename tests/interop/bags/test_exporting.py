@@ -11,28 +11,16 @@ from hypothesis import strategies as st
 from maplab_py.cancellation import CancelToken, obeying
 from maplab_py.errors import Cancelled, FlagError, MapError, UserError
 from maplab_py.geometry import se3
+from maplab_py.interop.bags import listing, map_scene, sensor_messages
 from maplab_py.interop.bags.exporting import export_bag
-from maplab_py.interop.bags.listing import bag_info
-from maplab_py.interop.bags.map_scene import export_mcap
 from maplab_py.interop.bags.options import BagExportOptions, PoseToBagOptions
 from maplab_py.interop.bags.poses import add_poses_to_bag, pose_times
-from maplab_py.interop.bags.sensor_messages import cloud_of
+from maplab_py.interop.recordings import bag_layouts, bag_writing, map_replay, reader_choice, stream
 from maplab_py.interop.recordings.bag_files import opened_bag
-from maplab_py.interop.recordings.bag_layouts import pose_messages
-from maplab_py.interop.recordings.bag_writing import (
-    BagFormat,
-    bag_files,
-    messages_of_topic,
-)
-from maplab_py.interop.recordings.bag_writing import write_bag as write_messages_as_bag
-from maplab_py.interop.recordings.map_replay import mission_sample_rows
 from maplab_py.interop.recordings.options import SourceOptions
-from maplab_py.interop.recordings.reader_choice import open_recording
-from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.interop.vertex_states import poses_at
 from maplab_py.progress import SilentProgress
-from maplab_py.sensors import Projection
-from maplab_py.sensors.sensors_yaml import write_sensors
+from maplab_py.sensors import Projection, sensors_yaml
 from maplab_py.vimap import LandmarkQuality, LoopClosureEdges, VIMap
 from tests.interop.bags import small_bags
 from tests.interop.recordings.written import frame_sets, make_content, samples, write_bag
@@ -42,16 +30,16 @@ pytest.importorskip("rosbags")
 
 
 @pytest.mark.parametrize("kind", small_bags.FORMATS)
-def test_rovioli_reads_what_the_map_has(tmp_path: Path, kind: BagFormat) -> None:
+def test_rovioli_reads_what_the_map_has(tmp_path: Path, kind: bag_writing.BagFormat) -> None:
     vi_map, images, _ = small_bags.map_with_resources()
     path = small_bags.named(tmp_path, kind)
     report = export_bag(vi_map, tmp_path, 0, path, BagExportOptions(format=kind.value))
     assert report.notes == ()
-    (tmp_path / "sensors.yaml").write_text(write_sensors(vi_map.sensors))
+    (tmp_path / "sensors.yaml").write_text(sensors_yaml.write_sensors(vi_map.sensors))
     source = SourceOptions(sensor_calibration_file=tmp_path / "sensors.yaml", imu_topic="/imu0")
-    events = list(EventStream(open_recording(path, source)))
+    events = list(stream.EventStream(reader_choice.open_recording(path, source)))
     times_ns, accel_gyro = samples(events)
-    rows = mission_sample_rows(vi_map, 0)
+    rows = map_replay.mission_sample_rows(vi_map, 0)
     np.testing.assert_array_equal(times_ns, vi_map.imu_samples.timestamp_ns[rows])
     np.testing.assert_array_equal(accel_gyro, vi_map.imu_samples.accel_gyro[rows])
     sets = frame_sets(events)
@@ -62,7 +50,7 @@ def test_rovioli_reads_what_the_map_has(tmp_path: Path, kind: BagFormat) -> None
 
 
 @pytest.mark.parametrize("kind", small_bags.FORMATS)
-def test_all_topics_read_back(tmp_path: Path, kind: BagFormat) -> None:
+def test_all_topics_read_back(tmp_path: Path, kind: bag_writing.BagFormat) -> None:
     vi_map, _, clouds = small_bags.map_with_resources()
     path = small_bags.named(tmp_path, kind)
     export_bag(vi_map, tmp_path, 0, path, BagExportOptions(format=kind.value))
@@ -72,7 +60,7 @@ def test_all_topics_read_back(tmp_path: Path, kind: BagFormat) -> None:
         "/path": 1,
         "/odometry": VERTICES,
         "/tf": VERTICES,
-        "/imu0": len(mission_sample_rows(vi_map, 0)),
+        "/imu0": len(map_replay.mission_sample_rows(vi_map, 0)),
         "/left/image_raw": VERTICES,
         "/cam0/camera_info": VERTICES,
         "/cam0/depth": 3,
@@ -94,7 +82,7 @@ def test_all_topics_read_back(tmp_path: Path, kind: BagFormat) -> None:
     assert depth.data.view("<u2")[-1] == 10_000  # mm
     for (time_ns, message), cloud in zip(topics["/points0"], clouds, strict=True):
         assert time_ns % 10 == (vi_map.vertices.timestamp_ns[0] + 7) % 10
-        read = cloud_of(message, "cloud")
+        read = sensor_messages.cloud_of(message, "cloud")
         for name in ("p", "colours", "intensity"):
             expected = getattr(cloud, name)
             if expected is None:
@@ -106,7 +94,7 @@ def test_all_topics_read_back(tmp_path: Path, kind: BagFormat) -> None:
 def test_only_what_is_asked_for(tmp_path: Path) -> None:
     options = BagExportOptions(content="imu, poses", format="sqlite3", world_frame="office")
     report = export_bag(make_map(), tmp_path, 1, tmp_path / "walk", options)
-    info = bag_info(tmp_path / "walk")
+    info = listing.bag_info(tmp_path / "walk")
     assert [(t.topic, t.messages) for t in info.topics] == [
         (t.topic, t.messages) for t in report.topics
     ]
@@ -147,7 +135,7 @@ def test_a_missing_image_leaves_no_bag(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", small_bags.FORMATS)
-def test_cancelling_leaves_no_bag(tmp_path: Path, kind: BagFormat) -> None:
+def test_cancelling_leaves_no_bag(tmp_path: Path, kind: bag_writing.BagFormat) -> None:
     class Impatient(SilentProgress):
         def step(self, done: float, total: float, what: str = "") -> None:
             if done > 0:
@@ -169,7 +157,7 @@ def test_cancelling_leaves_no_bag(tmp_path: Path, kind: BagFormat) -> None:
 def test_bag_info_lists_topics_and_finds_damage(tmp_path: Path) -> None:
     vi_map, _, _ = small_bags.map_with_resources()
     export_bag(vi_map, tmp_path, 0, tmp_path / "walk.bag")
-    info = bag_info(tmp_path / "walk.bag")
+    info = listing.bag_info(tmp_path / "walk.bag")
     assert (info.format, info.messages) == ("ros1", sum(t.messages for t in info.topics))
     assert info.start_ns == vi_map.vertices.timestamp_ns[0]
     imu = next(t for t in info.topics if t.topic == "/imu0")
@@ -179,9 +167,9 @@ def test_bag_info_lists_topics_and_finds_damage(tmp_path: Path) -> None:
     cut = tmp_path / "cut.bag"
     cut.write_bytes((tmp_path / "walk.bag").read_bytes()[:-100])
     with pytest.raises(MapError, match=r"cut\.bag: the bag cannot be read"):
-        bag_info(cut)
+        listing.bag_info(cut)
     with pytest.raises(UserError, match=r"none\.bag does not exist"):
-        bag_info(tmp_path / "none.bag")
+        listing.bag_info(tmp_path / "none.bag")
 
 
 pytest.importorskip("rosbags")
@@ -190,7 +178,7 @@ FIRST = np.array([0])
 VERTEX_RATE = PoseToBagOptions(interpolate_to_frequency_hz=1e-3)
 
 
-def recorded(folder: Path, kind: BagFormat) -> Path:
+def recorded(folder: Path, kind: bag_writing.BagFormat) -> Path:
     version = 2 if kind.is_ros_2 else 1
     return write_bag(
         make_content(), small_bags.named(folder, kind, "in"), version=version, storage=kind.value
@@ -203,7 +191,7 @@ def raw(path: Path) -> list[tuple[str, int, bytes]]:
 
 
 @pytest.mark.parametrize("kind", small_bags.FORMATS)
-def test_messages_stay_and_poses_come(tmp_path: Path, kind: BagFormat) -> None:
+def test_messages_stay_and_poses_come(tmp_path: Path, kind: bag_writing.BagFormat) -> None:
     vi_map, source = make_map(), recorded(tmp_path, kind)
     target = small_bags.named(tmp_path, kind)
     report = add_poses_to_bag(vi_map, source, target, VERTEX_RATE, missions=FIRST)
@@ -235,7 +223,7 @@ def test_messages_stay_and_poses_come(tmp_path: Path, kind: BagFormat) -> None:
 
 
 def test_several_missions_are_numbered_by_time(tmp_path: Path) -> None:
-    vi_map, source = make_map(), recorded(tmp_path, BagFormat.ROS1)
+    vi_map, source = make_map(), recorded(tmp_path, bag_writing.BagFormat.ROS1)
     options = PoseToBagOptions(base_frame="body", odom_frame="odom", world_frame="world")
     add_poses_to_bag(vi_map, source, tmp_path / "out.bag", options)
     topics = small_bags.messages_of(tmp_path / "out.bag")
@@ -250,7 +238,7 @@ def test_several_missions_are_numbered_by_time(tmp_path: Path) -> None:
 
 
 def test_poses_between_vertices(tmp_path: Path) -> None:
-    vi_map, source = make_map(), recorded(tmp_path, BagFormat.MCAP)
+    vi_map, source = make_map(), recorded(tmp_path, bag_writing.BagFormat.MCAP)
     options = PoseToBagOptions(add_tf=False, interpolate_to_frequency_hz=8.0)
     add_poses_to_bag(vi_map, source, tmp_path / "out", options, missions=FIRST)
     topics = small_bags.messages_of(tmp_path / "out")
@@ -279,7 +267,9 @@ def test_pose_times(gaps: list[int], period: int) -> None:
 
 
 @pytest.mark.parametrize("kind", small_bags.FORMATS)
-def test_a_bag_with_poses_gets_further_ones_or_loses_them(tmp_path: Path, kind: BagFormat) -> None:
+def test_a_bag_with_poses_gets_further_ones_or_loses_them(
+    tmp_path: Path, kind: bag_writing.BagFormat
+) -> None:
     vi_map, source = make_map(), recorded(tmp_path, kind)
     once, twice, dropped = (
         small_bags.named(tmp_path, kind, name) for name in ("once", "twice", "dropped")
@@ -293,16 +283,16 @@ def test_a_bag_with_poses_gets_further_ones_or_loses_them(tmp_path: Path, kind: 
     assert set(small_bags.messages_of(once)) - set(small_bags.messages_of(dropped)) == {"/tf"}
 
 
-@pytest.mark.parametrize("kind", [BagFormat.SQLITE3, BagFormat.MCAP])
-def test_a_single_file_of_a_ros_2_bag(tmp_path: Path, kind: BagFormat) -> None:
-    (file, _) = bag_files(recorded(tmp_path, kind), kind)
+@pytest.mark.parametrize("kind", [bag_writing.BagFormat.SQLITE3, bag_writing.BagFormat.MCAP])
+def test_a_single_file_of_a_ros_2_bag(tmp_path: Path, kind: bag_writing.BagFormat) -> None:
+    (file, _) = bag_writing.bag_files(recorded(tmp_path, kind), kind)
     report = add_poses_to_bag(make_map(), file, tmp_path / "out", VERTEX_RATE, missions=FIRST)
     assert report.format == kind.value
     assert len(small_bags.messages_of(tmp_path / "out")["/T_G_I"]) == VERTICES
 
 
 def test_wrong_bags_are_refused(tmp_path: Path) -> None:
-    vi_map, source = make_map(), recorded(tmp_path, BagFormat.ROS1)
+    vi_map, source = make_map(), recorded(tmp_path, bag_writing.BagFormat.ROS1)
     target = tmp_path / "out.bag"
 
     def refused(problem: str, kind: type[Exception] = UserError, **paths: Path) -> None:
@@ -326,9 +316,13 @@ def test_wrong_bags_are_refused(tmp_path: Path) -> None:
     refused("unindexed.bag: the bag cannot be read .*reindex", MapError, source=unindexed)
     wrong = tmp_path / "wrong.bag"
     times_ns = np.array([10, 20])
-    rows = pose_messages(times_ns, se3.identity(2), "map", is_ros_2=False)
+    rows = bag_layouts.pose_messages(times_ns, se3.identity(2), "map", is_ros_2=False)
     kind = "geometry_msgs/msg/PoseStamped"
-    write_messages_as_bag(wrong, BagFormat.ROS1, messages_of_topic(times_ns, "/tf", kind, rows))
+    bag_writing.write_bag(
+        wrong,
+        bag_writing.BagFormat.ROS1,
+        bag_writing.messages_of_topic(times_ns, "/tf", kind, rows),
+    )
     refused("/tf has messages of type .*drop_tf", MapError, source=wrong)
     with pytest.raises(UserError, match="no vertices"):
         add_poses_to_bag(VIMap(), source, target)
@@ -351,7 +345,7 @@ def test_poses_landmarks_closures_and_images_read_back(tmp_path: Path) -> None:
     vi_map = vi_map.replace(
         landmarks=landmarks.replace(quality=quality), loop_closure_edges=closure
     )
-    report = export_mcap(vi_map, tmp_path, tmp_path / "scene")
+    report = map_scene.export_mcap(vi_map, tmp_path, tmp_path / "scene")
     assert (tmp_path / "scene" / "scene.mcap").is_file()
     read = small_bags.messages_of(tmp_path / "scene")
     assert {topic.topic: topic.messages for topic in report.topics} == {
@@ -364,7 +358,7 @@ def test_poses_landmarks_closures_and_images_read_back(tmp_path: Path) -> None:
         [poses[t] for t in vi_map.vertices.timestamp_ns.tolist()], vi_map.T_G_I[:, 4:]
     )
     if len(landmarks):
-        cloud = cloud_of(by_kind["landmarks"][0][1], "landmarks")
+        cloud = sensor_messages.cloud_of(by_kind["landmarks"][0][1], "landmarks")
         assert np.allclose(cloud.p, vi_map.p_G, atol=1e-5)
     ends = by_kind["loop_closures"][0][1].points
     assert np.allclose([[p.x, p.y, p.z] for p in ends], vi_map.T_G_I[[0, 2], 4:])
@@ -378,10 +372,10 @@ def _position(pose: object) -> list[float]:
 
 def test_images_are_left_out_on_request(tmp_path: Path) -> None:
     vi_map = small_bags.map_with_resources()[0]
-    report = export_mcap(vi_map, tmp_path, tmp_path / "scene", images=False)
+    report = map_scene.export_mcap(vi_map, tmp_path, tmp_path / "scene", images=False)
     assert not any("image" in topic.topic for topic in report.topics)
 
 
 def test_an_empty_map_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no vertices: there is nothing to show"):
-        export_mcap(VIMap(), tmp_path, tmp_path / "scene")
+        map_scene.export_mcap(VIMap(), tmp_path, tmp_path / "scene")

@@ -11,11 +11,9 @@ import numpy as np
 import pytest
 
 from maplab_py.errors import MapError, UserError
-from maplab_py.interop.bags.exporting import export_bag
+from maplab_py.interop.bags import exporting, listing, poses
 from maplab_py.interop.bags.importing import import_bag_resources
-from maplab_py.interop.bags.listing import bag_info
 from maplab_py.interop.bags.options import BagExportOptions, BagImportOptions
-from maplab_py.interop.bags.poses import add_poses_to_bag
 from maplab_py.interop.bags.sensor_messages import CLOUD, COMPRESSED, IMAGE, MessageMaker
 from maplab_py.interop.ply import PlyCloud
 from maplab_py.interop.recordings.bag_files import message_types, opened_bag
@@ -44,7 +42,7 @@ ROS1 = MessageMaker(is_ros_2=False)
 def test_what_was_exported_comes_back(tmp_path: Path, kind: BagFormat) -> None:
     before, _, _ = small_bags.map_with_resources()
     path = small_bags.named(tmp_path, kind)
-    export_bag(before, tmp_path, 0, path, BagExportOptions(format=kind.value))
+    exporting.export_bag(before, tmp_path, 0, path, BagExportOptions(format=kind.value))
     bare = small_bags.with_time_offset(make_map())
     vi_map = bare
     for options in (
@@ -69,7 +67,7 @@ def test_what_was_exported_comes_back(tmp_path: Path, kind: BagFormat) -> None:
 
 def test_what_is_there_stays(tmp_path: Path) -> None:
     vi_map, _, _ = small_bags.map_with_resources()
-    export_bag(vi_map, tmp_path, 0, tmp_path / "walk.bag")
+    exporting.export_bag(vi_map, tmp_path, 0, tmp_path / "walk.bag")
     for options in (LEFT, BagImportOptions("/points0", sensor_id=IMU_ID)):
         again, report = import_bag_resources(vi_map, 0, tmp_path / "walk.bag", options)
         assert again is vi_map
@@ -111,7 +109,7 @@ def test_the_time_offset_is_added(tmp_path: Path) -> None:
     np.testing.assert_array_equal(attached.resources.owner, np.arange(VERTICES))
     clouds = tmp_path / "clouds.bag"
     with_clouds, _, _ = small_bags.map_with_resources()
-    export_bag(with_clouds, tmp_path, 0, clouds)
+    exporting.export_bag(with_clouds, tmp_path, 0, clouds)
     options = BagImportOptions("/points0", resource_time_offset_ns=1000, sensor_id=IMU_ID)
     attached, _ = import_bag_resources(vi_map, 0, clouds, options)
     expected = vi_map.vertices.timestamp_ns[:3] + 1007
@@ -185,7 +183,7 @@ def other_focal_length(vi_map: VIMap) -> VIMap:
 def test_a_calibration_of_another_camera_is_refused(
     tmp_path: Path, change: Callable[[VIMap], VIMap], problem: str
 ) -> None:
-    export_bag(small_bags.map_with_resources()[0], tmp_path, 0, tmp_path / "walk.bag")
+    exporting.export_bag(small_bags.map_with_resources()[0], tmp_path, 0, tmp_path / "walk.bag")
     vi_map = change(small_bags.with_time_offset(make_map()))
     options = BagImportOptions("/left/image_raw", camera_calibration_topic="/cam0/camera_info")
     with pytest.raises(UserError, match=f"walk.bag: /cam0/camera_info: .*{problem}.*--camera"):
@@ -195,7 +193,7 @@ def test_a_calibration_of_another_camera_is_refused(
 def test_wrong_topics_and_bags_are_refused(tmp_path: Path) -> None:
     vi_map, _, _ = small_bags.map_with_resources()
     path = tmp_path / "walk.bag"
-    export_bag(vi_map, tmp_path, 0, path)
+    exporting.export_bag(vi_map, tmp_path, 0, path)
 
     def refused(problem: str, kind: type[Exception] = UserError, **options: Any) -> None:
         bag = options.pop("path", path)
@@ -283,8 +281,8 @@ def tried(path: Path, vi_map: VIMap, target: Path) -> list[str]:
     """Use a bag in every way; return what was refused."""
     problems = []
     for use in (
-        lambda: bag_info(path),
-        lambda: add_poses_to_bag(vi_map, path, target),
+        lambda: listing.bag_info(path),
+        lambda: poses.add_poses_to_bag(vi_map, path, target),
         lambda: import_bag_resources(vi_map, 0, path, POSES),
     ):
         try:
@@ -298,7 +296,7 @@ def tried(path: Path, vi_map: VIMap, target: Path) -> list[str]:
 @pytest.mark.parametrize("kind", small_bags.FORMATS)
 def test_cut_bags(tmp_path: Path, kind: BagFormat, vi_map: VIMap) -> None:
     path = small_bags.named(tmp_path, kind)
-    export_bag(vi_map, tmp_path, 0, path, BagExportOptions(kind.value, CONTENT))
+    exporting.export_bag(vi_map, tmp_path, 0, path, BagExportOptions(kind.value, CONTENT))
     whole = bag_files(path, kind)[0].read_bytes()
     for number, length in enumerate(np.linspace(0, len(whole) - 1, 12).astype(int).tolist()):
         damaged = small_bags.named(tmp_path, kind, f"cut{number}")
@@ -318,7 +316,7 @@ def test_cut_bags(tmp_path: Path, kind: BagFormat, vi_map: VIMap) -> None:
 def test_changed_bags(tmp_path: Path, kind: BagFormat, vi_map: VIMap) -> None:
     rng = np.random.default_rng(7)
     path = small_bags.named(tmp_path, kind)
-    export_bag(vi_map, tmp_path, 0, path, BagExportOptions(kind.value, CONTENT))
+    exporting.export_bag(vi_map, tmp_path, 0, path, BagExportOptions(kind.value, CONTENT))
     whole = bag_files(path, kind)[0].read_bytes()
     for number in range(15):
         data = np.frombuffer(whole, dtype=np.uint8).copy()
@@ -328,15 +326,15 @@ def test_changed_bags(tmp_path: Path, kind: BagFormat, vi_map: VIMap) -> None:
 
 
 def test_a_folder_without_its_file(tmp_path: Path, vi_map: VIMap) -> None:
-    export_bag(vi_map, tmp_path, 0, tmp_path / "walk", BagExportOptions(content=CONTENT))
+    exporting.export_bag(vi_map, tmp_path, 0, tmp_path / "walk", BagExportOptions(content=CONTENT))
     (tmp_path / "walk" / "walk.mcap").unlink()
     with pytest.raises(MapError, match="walk: the bag cannot be read"):
-        bag_info(tmp_path / "walk")
+        listing.bag_info(tmp_path / "walk")
     (tmp_path / "walk" / "metadata.yaml").write_text(
         "- !!python/object/apply:os.system [touch x]\n"
     )
     with pytest.raises(MapError, match="walk: the bag cannot be read"):
-        bag_info(tmp_path / "walk")
+        listing.bag_info(tmp_path / "walk")
 
 
 ODD = "odd_msgs/msg/Odd"
@@ -359,10 +357,10 @@ def odd_bag(path: Path, kind: BagFormat) -> Path:
 @pytest.mark.parametrize("kind", small_bags.FORMATS)
 def test_unknown_types_are_listed_and_copied(tmp_path: Path, kind: BagFormat) -> None:
     source = odd_bag(small_bags.named(tmp_path, kind, "odd"), kind)
-    (topic,) = bag_info(source).topics
+    (topic,) = listing.bag_info(source).topics
     assert (topic.topic, topic.type, topic.messages) == ("/odd", ODD, 2)
     target = small_bags.named(tmp_path, kind, "out")
-    add_poses_to_bag(make_map(), source, target, missions=np.array([0]))
+    poses.add_poses_to_bag(make_map(), source, target, missions=np.array([0]))
     with opened_bag(target) as reader:
         (connection,) = [c for c in reader.connections if c.topic == "/odd"]
         read = [reader.deserialize(data, ODD) for _, _, data in reader.messages([connection])]
@@ -378,6 +376,6 @@ def test_types_without_definition_are_refused_by_name(tmp_path: Path) -> None:
         database.execute("DELETE FROM message_definitions")
         database.execute("UPDATE topics SET type_description_hash = ''")
     with pytest.raises(MapError, match=f"odd.*{ODD}") as error:
-        add_poses_to_bag(make_map(), source, tmp_path / "out")
+        poses.add_poses_to_bag(make_map(), source, tmp_path / "out")
     assert "\n" not in str(error.value)
     assert not (tmp_path / "out").exists()

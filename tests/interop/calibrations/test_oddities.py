@@ -9,9 +9,8 @@ import pytest
 from maplab_py.errors import MaplabError, UserError
 from maplab_py.frontend.odometry import Odometry
 from maplab_py.interop.calibration_import import import_calibration, read_calibration
+from maplab_py.interop.recordings import reader_choice, summary
 from maplab_py.interop.recordings.options import SourceOptions
-from maplab_py.interop.recordings.reader_choice import open_recording
-from maplab_py.interop.recordings.summary import summarise
 from maplab_py.sensors import Distortion, Projection
 from tests.interop.recordings.written import make_content, write_bag, write_folder
 from tests.interop.test_calibration_import import IMU
@@ -202,9 +201,9 @@ def test_sizes_are_compared_with_the_first_images(tmp_path: Path) -> None:
             MaplabError,
             match=r"camera 0: the image is 64 x 48, the calibration is of 48 x 64: does the",
         ):
-            open_recording(path, SourceOptions(swapped, imu))
+            reader_choice.open_recording(path, SourceOptions(swapped, imu))
     with pytest.raises(MaplabError, match=r"camera 1: the image is 64 x 48, .* of 32 x 24"):
-        open_recording(folder, SourceOptions(other, imu))
+        reader_choice.open_recording(folder, SourceOptions(other, imu))
 
 
 @pytest.mark.parametrize(
@@ -258,7 +257,7 @@ def test_files_of_the_first_maplab_are_joined(tmp_path: Path) -> None:
     np.testing.assert_allclose(result.T_I_C[0, 4:], [0.5, 0.0, 0.0])
     folder = write_folder(make_content(frames=1), tmp_path / "room")
     options = SourceOptions(rig, imu, rovio_active_camera_indices="0")
-    assert open_recording(folder, options).device.imu_id == result.imu_id
+    assert reader_choice.open_recording(folder, options).device.imu_id == result.imu_id
     assert import_calibration(rig).imu_id == ""
     assert import_calibration(imu).rig_id == ""
     kalibr = written(tmp_path / "kalibr.yaml", IMU)
@@ -276,7 +275,7 @@ def test_the_error_without_imu_names_the_flag(tmp_path: Path) -> None:
     folder = write_folder(make_content(frames=1), tmp_path / "room")
     chain = written(tmp_path / "chain.yaml", CAMERA)
     options = SourceOptions(chain, rovio_active_camera_indices="0")
-    recording = open_recording(folder, options)
+    recording = reader_choice.open_recording(folder, options)
     with pytest.raises(UserError, match="--imu_calibration_file=FILE"):
         Odometry(recording.device)
     assert "--imu_calibration_file" in recording.notes[0]
@@ -293,7 +292,7 @@ def test_notes_of_the_calibration_reach_the_reports(tmp_path: Path) -> None:
     folder = write_folder(make_content(frames=2), tmp_path / "room")
     chain = written(tmp_path / "chain.yaml", CAMERA + moved("T_imu_cam", 0.012, 3.0))
     options = SourceOptions(chain, rovio_active_camera_indices="0")
-    notes = summarise(open_recording(folder, options)).notes
+    notes = summary.summarise(reader_choice.open_recording(folder, options)).notes
     assert any("12 mm and 3 deg" in note for note in notes)
 
 

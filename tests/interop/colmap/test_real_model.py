@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 
 from maplab_py.console.session.session import Session
-from maplab_py.geometry import se3
-from maplab_py.geometry.alignment import umeyama
-from maplab_py.geometry.interpolation import interpolate_poses
+from maplab_py.geometry import alignment, interpolation, se3
 from maplab_py.interop.calibrations.parts import read_entry
 from maplab_py.interop.colmap.features import with_images
 from maplab_py.interop.colmap.importing import import_colmap
@@ -35,7 +33,7 @@ pytestmark = pytest.mark.slow
 
 
 def ate_m(p_A: np.ndarray, p_B: np.ndarray) -> float:
-    T_A_B, scale = umeyama(p_A, p_B, with_scale=True)
+    T_A_B, scale = alignment.umeyama(p_A, p_B, with_scale=True)
     error = se3.transform(T_A_B, scale * p_B) - p_A
     return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
 
@@ -80,7 +78,7 @@ def test_a_reconstruction_of_recorded_images(model: Model) -> None:
     assert not vi_map.missions.sensor_id[0, MissionSensor.IMU].any()
     assert set(vi_map.feature_type.tolist()) == {int(FeatureType.SIFT)}
     truth = read_trajectory(truth_file)
-    T_G_I, valid = interpolate_poses(truth.times_ns, truth.T_R_B, times_ns)
+    T_G_I, valid = interpolation.interpolate_poses(truth.times_ns, truth.T_R_B, times_ns)
     p_G = T_G_I[valid, 4:]
     of_model = ate_m(p_G, np.array([centre for _, centre in model.centres])[valid])
     error = vi_map.T_G_I[valid, 4:] - p_G
@@ -110,7 +108,7 @@ def write_tum(path: Path, trajectory: Trajectory) -> Path:
 def images_alone(vi_map: VIMap, images: Path, names: list[str], truth: Trajectory) -> VIMap:
     """Return a map of images without features; of the truth only the attitude is used later."""
     times_ns = np.array([int(Path(name).stem) for name in names])
-    T_G_C, valid = interpolate_poses(truth.times_ns, truth.T_R_B, times_ns)
+    T_G_C, valid = interpolation.interpolate_poses(truth.times_ns, truth.T_R_B, times_ns)
     assert valid.all()
     count, rng = len(names), np.random.default_rng(0)
     result = VIMap(

@@ -14,18 +14,15 @@ import pytest
 from maplab_py.algorithms.evaluation.map_comparison import compare_maps
 from maplab_py.errors import FlagError, MapError, UserError
 from maplab_py.geometry import se3, so3
-from maplab_py.interop.calibration_import import import_calibration
+from maplab_py.interop import calibration_import, trajectories
 from maplab_py.interop.colmap.binary import compile_kernels
 from maplab_py.interop.colmap.exporting import export_colmap, model_of_map
 from maplab_py.interop.colmap.importing import image_times, import_colmap, read_times
 from maplab_py.interop.colmap.model import FILE_NAME
 from maplab_py.interop.colmap.options import ColmapExportOptions, ColmapImportOptions
-from maplab_py.interop.trajectories import Trajectory, write_tum
 from maplab_py.sensors import Distortion, Projection
 from maplab_py.storage.native import load_map, save_map
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.consistency import check_consistency
-from maplab_py.vimap.queries import is_metric
+from maplab_py.vimap import VIMap, consistency, queries
 from tests.interop.small_map import make_map
 from tests.support.data import shared_data
 from tests.support.scene import Scene
@@ -82,7 +79,7 @@ def test_everything_that_both_have_comes_back(
     assert compared.keypoint_px.largest < 1e-9
     assert compared.time_ns.largest == 0.0
     assert compared.descriptors_differing == 0
-    assert not check_consistency(again).errors
+    assert not consistency.check_consistency(again).errors
 
 
 def test_pycolmap_sees_the_same_errors(rig_map: VIMap, tmp_path: Path) -> None:
@@ -98,7 +95,7 @@ def test_a_model_without_side_file_is_a_mission_of_each_rig(tmp_path: Path) -> N
     (tmp_path / FILE_NAME).unlink()
     again, report = import_colmap(tmp_path)
     assert len(again.missions) == 1
-    assert not is_metric(again, 0)
+    assert not queries.is_metric(again, 0)
     assert "arbitrary" in report.notes[0]
     # the body is the first camera now; times come from the images' names
     T_G_C = se3.compose(
@@ -112,7 +109,7 @@ def test_a_model_without_side_file_is_a_mission_of_each_rig(tmp_path: Path) -> N
     save_map(again, tmp_path / "map")
     loaded, _ = load_map(tmp_path / "map")
     assert compare_maps(again, loaded).position_m.largest == 0.0
-    assert not is_metric(loaded, 0)
+    assert not queries.is_metric(loaded, 0)
 
 
 def _ids(vi_map: VIMap) -> tuple[str, str]:
@@ -155,14 +152,14 @@ def test_alignment_finds_scale_gravity_and_the_lever_arm(tmp_path: Path) -> None
     vi_map = Scene(vertices=10, landmarks=60).make()
     export_colmap(vi_map, tmp_path / "model", EVERYTHING)
     turn = se3.make(so3.exp([0.4, -0.3, 0.8]), [3.0, 2.0, 1.0])
-    truth = Trajectory(vi_map.vertices.timestamp_ns, se3.compose(turn, vi_map.T_G_I))
-    write_tum(truth, tmp_path / "truth.txt")
+    truth = trajectories.Trajectory(vi_map.vertices.timestamp_ns, se3.compose(turn, vi_map.T_G_I))
+    trajectories.write_tum(truth, tmp_path / "truth.txt")
     options = ColmapImportOptions(align_to=str(tmp_path / "truth.txt"))
     again, report = import_colmap(tmp_path / "model", options)
     assert np.allclose(again.T_G_I, truth.T_R_B, atol=1e-6)
     assert report.scale == pytest.approx(1.0, abs=1e-6)
     assert report.aligned_vertices == 10
-    assert is_metric(again, 0)
+    assert queries.is_metric(again, 0)
 
 
 def test_scale_and_gravity_by_flags(tmp_path: Path) -> None:
@@ -177,7 +174,7 @@ def test_scale_and_gravity_by_flags(tmp_path: Path) -> None:
         so3.multiply(again.T_G_I[:, :4], so3.inverse(plain.T_G_I[:, :4])), [0, 1, 0]
     )
     assert np.allclose(turned, [0.0, 0.0, -1.0], atol=1e-9)
-    assert is_metric(again, 0)
+    assert queries.is_metric(again, 0)
 
 
 def test_omni_cameras_are_refused_or_undistorted(tmp_path: Path) -> None:
@@ -239,7 +236,7 @@ def cameras_txt(folder: Path, *lines: str) -> Path:
 
 
 def test_a_file_of_one_camera(tmp_path: Path) -> None:
-    calibration = import_calibration(cameras_txt(tmp_path, OPENCV))
+    calibration = calibration_import.import_calibration(cameras_txt(tmp_path, OPENCV))
     assert calibration.format == "COLMAP"
     assert not calibration.imu_id
     rig = calibration.sensors.camera_rig(calibration.rig_id)
@@ -256,7 +253,7 @@ def test_the_rig_of_a_model(rig_map, tmp_path: Path, form: str) -> None:  # type
     one = rig_map
     options = ColmapExportOptions(colmap_format=form)
     export_colmap(one, tmp_path / "model", options)
-    calibration = import_calibration(tmp_path / "model")
+    calibration = calibration_import.import_calibration(tmp_path / "model")
     rig = calibration.sensors.camera_rig(calibration.rig_id)
     (original,) = (sensor for sensor in one.sensors.sensors.values() if hasattr(sensor, "cameras"))
     assert len(rig.cameras) == len(original.cameras)
@@ -283,7 +280,7 @@ def test_the_rig_of_a_model(rig_map, tmp_path: Path, form: str) -> None:  # type
 )
 def test_wrong_files_are_refused(tmp_path: Path, lines: tuple[str, ...], message: str) -> None:
     with pytest.raises((MapError, UserError), match=message):
-        import_calibration(cameras_txt(tmp_path, *lines))
+        calibration_import.import_calibration(cameras_txt(tmp_path, *lines))
 
 
 def test_a_cut_binary_file_is_refused(rig_map, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
@@ -293,7 +290,7 @@ def test_a_cut_binary_file_is_refused(rig_map, tmp_path: Path) -> None:  # type:
     for size in range(0, len(data), 29):
         path.write_bytes(data[:size])
         with pytest.raises(MapError, match=r"cameras\.bin: is damaged"):
-            import_calibration(path)
+            calibration_import.import_calibration(path)
 
 
 @pytest.mark.parametrize(("name", "number"), [("SIFT", 3), ("Binary", 0)])

@@ -11,12 +11,11 @@ import pytest
 
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3, so3
-from maplab_py.interop.colmap.exporting import export_colmap
+from maplab_py.interop.colmap import exporting, reading
 from maplab_py.interop.colmap.features import SCALED, UNDISTORTED, agreement
 from maplab_py.interop.colmap.importing import import_colmap
 from maplab_py.interop.colmap.model import FILE_NAME
 from maplab_py.interop.colmap.options import ColmapExportOptions, ColmapImportOptions
-from maplab_py.interop.colmap.reading import read_model
 from tests.interop.colmap.test_round_trip import PINHOLES, Scene
 
 ORDER = ColmapImportOptions(timestamps_from="order")
@@ -28,7 +27,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("model")
     options = ColmapExportOptions(quality="all", colmap_format="text", colmap_database=True)
     vi_map = Scene(missions=1, vertices=8, models=PINHOLES[:2], landmarks=150).make()
-    export_colmap(vi_map, folder, options)
+    exporting.export_colmap(vi_map, folder, options)
     (folder / FILE_NAME).unlink()
     return folder
 
@@ -63,9 +62,9 @@ def edit_keypoints(database: Path, change: object) -> None:
 
 
 def test_names_keep_their_blanks(copy: Path) -> None:
-    before = read_model(copy).images.name
+    before = reading.read_model(copy).images.name
     edit_images(copy, lambda w: [*w[:9], f"Phone of A. Müller/IMG  {w[0]} (1).png"])
-    named = read_model(copy)
+    named = reading.read_model(copy)
     assert named.images.name == tuple(
         f"Phone of A. Müller/IMG  {number} (1).png" for number in named.images.id.tolist()
     )
@@ -97,15 +96,15 @@ def test_a_fault_of_the_converted_copy_names_the_text_file(copy: Path) -> None:
     with pytest.raises(
         MapError, match=rf"^{path}: is damaged: the images of camera \d+ have no pixels"
     ):
-        read_model(copy)
+        reading.read_model(copy)
 
 
 def test_quaternions_of_any_length_are_read(copy: Path) -> None:
     for name in ("rigs", "frames"):
         (copy / f"{name}.txt").unlink()
-    before = read_model(copy).images.T_C_W
+    before = reading.read_model(copy).images.T_C_W
     edit_images(copy, lambda w: [w[0], *(str(2.0 * float(q)) for q in w[1:5]), *w[5:]])
-    np.testing.assert_allclose(read_model(copy).images.T_C_W, before, atol=1e-12)
+    np.testing.assert_allclose(reading.read_model(copy).images.T_C_W, before, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", ["cameras", "points3D", "frames", "rigs"])

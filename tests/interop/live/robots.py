@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from maplab_py.interop.recordings.protocol import CameraImage, ImuBatch, RecordedSensors
-from maplab_py.interop.recordings.reader_choice import open_recording
+from maplab_py.interop.recordings import protocol, reader_choice
 from tests.interop.live.environments import in_network_namespace, python_of
 from tests.interop.recordings.written import write_calibration
 
@@ -60,7 +59,7 @@ def last_report(printed: str) -> dict[str, Any]:
 
 def write_messages(
     source: Path, folder: Path, *, seconds: float = 0.0, cameras: Sequence[int] = (0, 1)
-) -> RecordedSensors:
+) -> protocol.RecordedSensors:
     """Write what a robot is to send (messages.npz) and its calibration (sensors.yaml).
 
     Args:
@@ -69,16 +68,16 @@ def write_messages(
         seconds: Length of the part; 0 = all.
         cameras: Those that are played.
     """
-    recording = open_recording(source)
+    recording = reader_choice.open_recording(source)
     write_calibration(recording.device, folder / "sensors.yaml")
     end_ns = recording.start_ns + round(seconds * 1e9) if seconds else None
     times, samples = [], []
     images: dict[int, list[tuple[int, Any]]] = {camera: [] for camera in cameras}
     for item in recording.items(None, end_ns):
-        if isinstance(item, ImuBatch):
+        if isinstance(item, protocol.ImuBatch):
             times.append(item.times_ns)
             samples.append(item.accel_gyro)
-        elif isinstance(item, CameraImage) and item.camera in images:
+        elif isinstance(item, protocol.CameraImage) and item.camera in images:
             images[item.camera].append((item.stamp_ns, item.decode()))
     arrays: dict[str, Any] = {"imu_ns": np.concatenate(times), "imu": np.concatenate(samples)}
     for camera, stamped in images.items():

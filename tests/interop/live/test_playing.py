@@ -18,10 +18,9 @@ from maplab_py.interop.live.options import LiveOptions, NetworkOptions
 from maplab_py.interop.live.playing import PlayingOptions, play_recording
 from maplab_py.interop.live.publishing import Estimate, PosePublisher, ros_covariances
 from maplab_py.interop.live.transport import wait_for_topics
-from maplab_py.interop.recordings.bag_files import message_types
+from maplab_py.interop.recordings import bag_files, stream
 from maplab_py.interop.recordings.options import SourceOptions
 from maplab_py.interop.recordings.reader_choice import open_recording
-from maplab_py.interop.recordings.stream import EventStream
 from tests.interop.live import support
 from tests.interop.recordings import written
 
@@ -70,7 +69,7 @@ def test_a_played_recording_is_recorded_stamp_by_stamp(
         player.join()
     assert [t.messages for t in report.topics] == [len(content.imu_ns), 8, 8]
     again = open_recording(tmp_path / name, SourceOptions(sensor_calibration_file=calibration))
-    written.assert_content(list(EventStream(again)), content)
+    written.assert_content(list(stream.EventStream(again)), content)
 
 
 def test_a_bag_of_ros_2_is_a_folder(tmp_path: Path) -> None:
@@ -170,7 +169,7 @@ def test_ros_2_is_played_and_recorded_by_two_programs(
     assert player.wait(60) == 0
     assert done.returncode == 0, done.stderr
     again = open_recording(bag, SourceOptions(sensor_calibration_file=calibration))
-    written.assert_content(list(EventStream(again)), content)
+    written.assert_content(list(stream.EventStream(again)), content)
 
 
 def random_estimate(seed: int, *, is_localised: bool = True) -> Estimate:
@@ -194,7 +193,7 @@ def test_the_estimate_is_in_the_messages(is_ros_2: bool) -> None:
     publisher = PosePublisher(transport, LiveOptions(publish_landmarks=True))
     publisher.publish(estimate)
     publisher.publish_landmarks(5, np.ones((4, 3)))
-    store = message_types(is_ros_2=is_ros_2)
+    store = bag_files.message_types(is_ros_2=is_ros_2)
     decode = store.deserialize_cdr if is_ros_2 else store.deserialize_ros1
     odometry = decode(transport.published["/maplab/odometry"][0], "nav_msgs/msg/Odometry")
     assert (odometry.header.frame_id, odometry.child_frame_id) == ("odom", "imu")
@@ -222,7 +221,7 @@ def test_without_a_map_there_is_no_pose_in_it() -> None:
     transport = support.FakeTransport()
     PosePublisher(transport, LiveOptions()).publish(random_estimate(2, is_localised=False))
     assert transport.published["/maplab/pose_in_map"] == []
-    message = message_types(is_ros_2=True).deserialize_cdr(
+    message = bag_files.message_types(is_ros_2=True).deserialize_cdr(
         transport.published["/tf"][0], "tf2_msgs/msg/TFMessage"
     )
     assert [t.child_frame_id for t in message.transforms] == ["imu"]

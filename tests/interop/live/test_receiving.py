@@ -17,9 +17,8 @@ from maplab_py.interop.live.options import LiveOptions, NetworkOptions
 from maplab_py.interop.live.receiving import Inbox, Message, SetMatcher, TopicCounts
 from maplab_py.interop.live.source import image_data, imu_values
 from maplab_py.interop.live.transport import Topic
-from maplab_py.interop.recordings.bag_files import message_types
+from maplab_py.interop.recordings import bag_files, paired_imu
 from maplab_py.interop.recordings.options import SourceOptions, StreamOptions
-from maplab_py.interop.recordings.paired_imu import PairedImu
 from maplab_py.interop.recordings.protocol import CameraImage, FrameSet, ImuBatch, RecordedSensors
 from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.sensors import Camera, Distortion, Projection
@@ -108,7 +107,7 @@ def test_stamps_that_do_not_increase_are_counted_and_left_out() -> None:
 
 
 def test_the_accelerometer_is_interpolated_at_the_times_of_the_gyroscope() -> None:
-    paired = PairedImu()
+    paired = paired_imu.PairedImu()
     joined = paired.add(1, 0, (0.0, 0.0, 0.0, 9.0, 9.0, 9.0))
     joined += paired.add(0, 5, (9.0, 9.0, 9.0, 1.0, 2.0, 3.0))
     assert joined == []  # the accelerometer has not got so far
@@ -118,7 +117,7 @@ def test_the_accelerometer_is_interpolated_at_the_times_of_the_gyroscope() -> No
 
 @given(st.binary(max_size=290), st.booleans())
 def test_damaged_messages_are_errors_of_the_map(data: bytes, is_ros_2: bool) -> None:
-    store = message_types(is_ros_2=is_ros_2)
+    store = bag_files.message_types(is_ros_2=is_ros_2)
     for kind in ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"):
         with pytest.raises(MapError, match=r"^m: "):
             image_data(data, kind, CAMERA, "m", store, is_ros_2=is_ros_2).check()
@@ -129,7 +128,7 @@ def test_damaged_messages_are_errors_of_the_map(data: bytes, is_ros_2: bool) -> 
 def test_a_message_that_claims_a_huge_array_is_refused() -> None:
     head = b"\x00\x01\x00\x00" + struct.pack("<iII", 0, 0, 1) + b"\0" * 4
     head += struct.pack("<III", 6, 8, 6) + b"mono8\0" + b"\0\0" + struct.pack("<II", 8, 2**32 - 1)
-    store = message_types(is_ros_2=True)
+    store = bag_files.message_types(is_ros_2=True)
     with pytest.raises(MapError, match=r"damaged|truncated"):
         image_data(head, "sensor_msgs/msg/Image", CAMERA, "m", store, is_ros_2=True).check()
 

@@ -8,10 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from maplab_py.errors import UserError
-from maplab_py.interop.live import ros1
+from maplab_py.interop.live import ros1, transport
 from maplab_py.interop.live.connection import open_transport
 from maplab_py.interop.live.options import NetworkOptions
-from maplab_py.interop.live.transport import Topic, wait_for_topics
 from tests.interop.live.support import IMU, imu_message, small_master
 from tests.support.waiting import wait_until
 
@@ -53,8 +52,8 @@ def test_messages_pass_between_two_nodes() -> None:
         network = NetworkOptions(ros_master_uri=master.uri)
         with open_transport("ros1", network) as robot, open_transport("ros1", network) as listener:
             publish = robot.advertise("/imu0", IMU)
-            (topic,) = wait_for_topics(listener, ["/imu0"], 5.0)
-            assert topic == Topic("/imu0", IMU)
+            (topic,) = transport.wait_for_topics(listener, ["/imu0"], 5.0)
+            assert topic == transport.Topic("/imu0", IMU)
             assert robot.topics() == {}  # its own do not count
             received: list[bytes] = []
             listener.subscribe(topic, received.append)
@@ -75,7 +74,7 @@ def test_a_publisher_that_starts_again_is_found() -> None:
                 with open_transport("ros1", network) as robot:
                     publish = robot.advertise("/imu0", IMU)
                     if not round_number:
-                        listener.subscribe(Topic("/imu0", IMU), received.append)
+                        listener.subscribe(transport.Topic("/imu0", IMU), received.append)
                     assert wait_until(lambda: robot.subscribers("/imu0"))
                     publish(imu_message(round_number + 1, is_ros_2=False))
                     assert wait_until(lambda n=round_number: len(received) == n + 1)
@@ -91,7 +90,7 @@ def test_a_master_that_starts_again_is_told_of_the_topics() -> None:
         received: list[bytes] = []
         with open_transport("ros1", network) as robot:
             robot.advertise("/imu0", IMU)
-            listener.subscribe(Topic("/imu0", IMU), received.append)
+            listener.subscribe(transport.Topic("/imu0", IMU), received.append)
             assert wait_until(lambda: robot.subscribers("/imu0"))
     assert wait_until(lambda: any("does not answer" in p for p in listener.problems))
     with small_master(port), open_transport("ros1", network) as robot:
@@ -108,7 +107,7 @@ def test_a_subscriber_of_another_type_is_refused() -> None:
         network = NetworkOptions(ros_master_uri=master.uri)
         with open_transport("ros1", network) as robot, open_transport("ros1", network) as listener:
             robot.advertise("/imu0", IMU)
-            listener.subscribe(Topic("/imu0", "nav_msgs/msg/Odometry"), lambda _: None)
+            listener.subscribe(transport.Topic("/imu0", "nav_msgs/msg/Odometry"), lambda _: None)
             assert wait_until(lambda: listener.problems)
             assert "/imu0 has the type sensor_msgs/Imu" in listener.problems[0]
 

@@ -8,15 +8,11 @@ import numpy as np
 import pytest
 
 from maplab_py.errors import UserError
-from maplab_py.interop.live import ros2
-from maplab_py.interop.live.connection import open_transport
+from maplab_py.interop.live import connection, receiving, ros2, transport
 from maplab_py.interop.live.options import NetworkOptions
-from maplab_py.interop.live.receiving import TopicCounts
 from maplab_py.interop.live.ros2 import dds_type_name, ros_type_name
-from maplab_py.interop.live.transport import Topic, wait_for_topics
 from tests.interop.live.support import IMU, imu_message
-from tests.support.own_process import in_own_process
-from tests.support.waiting import wait_until
+from tests.support import own_process, waiting
 
 pytest.importorskip("cyclonedds", reason="no cyclonedds for this machine")
 
@@ -26,20 +22,20 @@ def _domain() -> int:
 
 
 def _round_trip() -> tuple[int, bool, list[str]]:
-    with open_transport("ros2", NetworkOptions(ros_domain_id=_domain())) as node:
+    with connection.open_transport("ros2", NetworkOptions(ros_domain_id=_domain())) as node:
         publish = node.advertise("/imu0", IMU)
         received: list[bytes] = []
-        node.subscribe(Topic("/imu0", IMU), received.append)
-        assert wait_until(lambda: node.subscribers("/imu0"))
+        node.subscribe(transport.Topic("/imu0", IMU), received.append)
+        assert waiting.wait_until(lambda: node.subscribers("/imu0"))
         sent = [imu_message(t, is_ros_2=True) for t in (1, 2, 3)]
         for message in sent:
             publish(message)
-        assert wait_until(lambda: len(received) == 3)
+        assert waiting.wait_until(lambda: len(received) == 3)
         return len(received), received == sent, list(node.topics())
 
 
 def test_messages_arrive_byte_by_byte() -> None:
-    count, is_equal, others = in_own_process(_round_trip)
+    count, is_equal, others = own_process.in_own_process(_round_trip)
     assert (count, is_equal) == (3, True)
     assert others == []  # its own topics do not count
 
@@ -96,10 +92,10 @@ for index in range(160):
 def _with_a_hole() -> tuple[int, int]:
     program = subprocess.Popen([sys.executable, "-c", _SENDER, str(_domain())])
     try:
-        with open_transport("ros2", NetworkOptions(ros_domain_id=_domain())) as node:
-            (topic,) = wait_for_topics(node, ["/image"], 60.0)
+        with connection.open_transport("ros2", NetworkOptions(ros_domain_id=_domain())) as node:
+            (topic,) = transport.wait_for_topics(node, ["/image"], 60.0)
             assert not topic.is_reliable
-            counts = TopicCounts()
+            counts = receiving.TopicCounts()
             node.subscribe(topic, lambda data: counts.stamp_of(data, is_ros_2=True))
             assert program.wait(60.0) == 0
             return counts.received, counts.missing
@@ -109,21 +105,21 @@ def _with_a_hole() -> tuple[int, int]:
 
 def test_lost_images_are_counted() -> None:
     """By best effort the first ones may be lost as well, before the two have found each other."""
-    received, missing = in_own_process(_with_a_hole)
+    received, missing = own_process.in_own_process(_with_a_hole)
     assert missing == 10
     assert 60 < received <= 150
 
 
 def _wrong_interface() -> str:
     try:
-        with open_transport("ros2", NetworkOptions(live_interface="203.0.113.9")):
+        with connection.open_transport("ros2", NetworkOptions(live_interface="203.0.113.9")):
             return ""
     except UserError as error:
         return str(error)
 
 
 def test_an_address_that_this_computer_does_not_have_is_refused() -> None:
-    assert "DDS cannot start" in in_own_process(_wrong_interface)
+    assert "DDS cannot start" in own_process.in_own_process(_wrong_interface)
 
 
 def test_the_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,11 +11,10 @@ import pytest
 
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.calibration_import import import_calibration
-from maplab_py.interop.recordings.clocks import ClockFilter, ClockRestart, parts_of
+from maplab_py.interop.recordings import clocks, summary
 from maplab_py.interop.recordings.options import ReadingOptions, SourceOptions, StreamOptions
 from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.recordings.stream import EventStream
-from maplab_py.interop.recordings.summary import summarise
 from tests.interop.recordings.written import (
     START_NS,
     Content,
@@ -101,7 +100,7 @@ def opened(path: Path, calibration: Path, imu_topic: str = "", **reading: Any):
 def test_rows_that_are_left_out(
     stamps: list[int], parts: list[list[int]], dropped: list[int]
 ) -> None:
-    kept, left_out = parts_of(np.array(stamps) * 10**7)
+    kept, left_out = clocks.parts_of(np.array(stamps) * 10**7)
     assert [part.tolist() for part in kept] == parts
     assert left_out.tolist() == dropped
 
@@ -109,8 +108,8 @@ def test_rows_that_are_left_out(
 def test_stamps_that_simply_follow_pass_as_if_pushed() -> None:
     rng = np.random.default_rng(8)
     steps = rng.choice([100, 100, 100, 0, -150, -100_000, 2 * 86_400_000], size=2000, p=P_STEPS)
-    pushed: ClockFilter[int] = ClockFilter()
-    mixed: ClockFilter[int] = ClockFilter()
+    pushed: clocks.ClockFilter[int] = clocks.ClockFilter()
+    mixed: clocks.ClockFilter[int] = clocks.ClockFilter()
     restarts = 0
     for row, stamp_ns in enumerate((np.cumsum(steps) * 1_000_000 + START_NS).tolist()):
         expected = pushed.push(stamp_ns, row)
@@ -129,7 +128,7 @@ def test_stamps_that_simply_follow_pass_as_if_pushed() -> None:
 def test_four_runs() -> None:
     run = np.arange(40) * 50_000_000
     stamps = np.concatenate([run, run, run + 10**18, run])
-    kept, left_out = parts_of(stamps)
+    kept, left_out = clocks.parts_of(stamps)
     assert [part.tolist() for part in kept] == np.arange(160).reshape(4, 40).tolist()
     assert not len(left_out)
 
@@ -163,14 +162,14 @@ def test_parts_of_a_folder(tmp_path: Path) -> None:
     for part, run in enumerate(runs, start=1):
         options = SourceOptions(reading=ReadingOptions(recording_part=part))
         assert_content(list(EventStream(open_recording(folder, options))), run)
-    report = summarise(open_recording(folder))
+    report = summary.summarise(open_recording(folder))
     assert [part.part for part in report.parts] == [1, 2, 3]
     assert {part.images for part in report.parts} == {28}
     assert report.imu is not None
     assert report.imu.samples == len(runs[0].imu_ns)
     assert "figures are of part 1 of 3" in report.notes[0]
     with pytest.raises(
-        ClockRestart, match=r"data.csv:\d+: the clock starts again: \d+ comes after"
+        clocks.ClockRestart, match=r"data.csv:\d+: the clock starts again: \d+ comes after"
     ):
         list(EventStream(open_recording(folder)))
     stream = EventStream(open_recording(folder), StreamOptions(end_s=0.5))
@@ -190,9 +189,9 @@ def test_parts_of_a_bag(tmp_path: Path, calibration: Path) -> None:
         recording = opened(path, calibration, recording_part=part)
         assert recording.start_ns == int(run.imu_ns[0])
         assert_content(list(EventStream(recording)), run)
-    report = summarise(opened(path, calibration))
+    report = summary.summarise(opened(path, calibration))
     assert [(part.part, part.images) for part in report.parts] == [(1, 28), (2, 28), (3, 28)]
-    with pytest.raises(ClockRestart, match="--recording_part=N"):
+    with pytest.raises(clocks.ClockRestart, match="--recording_part=N"):
         list(EventStream(opened(path, calibration)))
     ended = EventStream(opened(path, calibration), StreamOptions(end_s=0.3))
     assert frame_sets(list(ended))
@@ -304,7 +303,7 @@ def test_gyroscope_and_accelerometer_on_two_topics(tmp_path: Path, calibration: 
     np.testing.assert_array_equal(times_ns, content.imu_ns[: len(times_ns)])
     assert len(times_ns) >= len(content.imu_ns) - 3
     np.testing.assert_allclose(values, content.accel_gyro[: len(times_ns)], atol=1e-12)
-    report = summarise(opened(path, calibration, "/gyro"))
+    report = summary.summarise(opened(path, calibration, "/gyro"))
     assert any(
         "all accelerations of the IMU are 0: --imu_topic=GYRO,ACCEL" in n for n in report.notes
     )
@@ -335,7 +334,7 @@ def test_what_is_odd_is_noted(tmp_path: Path) -> None:
     stamps[1][:] += 7_000_000
     folder = write_folder(dataclasses.replace(slow, stamps_ns=stamps), tmp_path / "room")
     (folder / "mav0/cam3").mkdir()
-    notes = " | ".join(summarise(open_recording(folder)).notes)
+    notes = " | ".join(summary.summarise(open_recording(folder)).notes)
     for words in (
         "cam3: not read",
         "the IMU delivers 25 samples per second",

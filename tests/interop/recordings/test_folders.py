@@ -12,13 +12,11 @@ import pytest
 
 from maplab_py.errors import FlagError, MapError, MaplabError, UserError
 from maplab_py.geometry import se3
+from maplab_py.interop.recordings import protocol, summary
 from maplab_py.interop.recordings.options import ReadingOptions, SourceOptions, StreamOptions
-from maplab_py.interop.recordings.protocol import CameraImage, FrameSet, ImuBatch
 from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.recordings.stream import EventStream
-from maplab_py.interop.recordings.summary import summarise
-from maplab_py.sensors import Distortion
-from maplab_py.sensors.sensors_yaml import write_sensors
+from maplab_py.sensors import Distortion, sensors_yaml
 from maplab_py.simulation.raw_data import write_raw_data
 from maplab_py.simulation.simulate import simulate
 from tests.interop.recordings.written import (
@@ -76,7 +74,7 @@ def test_an_imu_in_us_beside_images_in_ns(tmp_path: Path) -> None:
     header, *rows = table.read_text().splitlines()
     shortened = [f"{row[:16]}{row[19:]}" for row in rows]
     table.write_text("\n".join([header, *shortened]) + "\n")
-    report = summarise(open_recording(folder))
+    report = summary.summarise(open_recording(folder))
     assert report.imu is not None
     assert (report.frame_sets, report.imu.samples) == (6, len(rows))
     assert report.imu.rate_hz == pytest.approx(200.0)
@@ -96,7 +94,7 @@ def test_missing_images_of_all_cameras_are_listed_and_left_out(tmp_path: Path) -
     with pytest.raises(MapError, match=message):
         list(EventStream(open_recording(folder)))
     skipping = SourceOptions(reading=ReadingOptions(skip_missing_images=True))
-    report = summarise(open_recording(folder, skipping))
+    report = summary.summarise(open_recording(folder, skipping))
     assert report.frame_sets == 5
     assert [note for note in report.notes if "missing, left out" in note] == [
         f"missing, left out: {path}" for path in missing
@@ -127,7 +125,7 @@ def test_sensors_of_a_folder(folder: Path) -> None:
     assert device.T_I_C[:, 4:].tolist() == [[0.0, 0.0, 0.02], [0.1, 0.0, 0.02]]
     again = open_recording(folder).device
     assert (again.imu_id, again.rig_id) == (device.imu_id, device.rig_id)
-    assert write_sensors(again.sensors) == write_sensors(device.sensors)
+    assert sensors_yaml.write_sensors(again.sensors) == sensors_yaml.write_sensors(device.sensors)
 
 
 def test_cameras_are_on_the_imu_even_if_it_is_not_the_body(folder: Path) -> None:
@@ -157,7 +155,7 @@ def test_a_time_offset_replaces_that_of_the_calibration(folder: Path) -> None:
     late = open_recording(folder, SourceOptions(imu_to_camera_time_offset_ns=4_000_000))
     assert {camera.time_offset_ns for camera in late.device.cameras} == {4_000_000}
     images, late_images = (
-        [item for item in recording.items() if isinstance(item, CameraImage)]
+        [item for item in recording.items() if isinstance(item, protocol.CameraImage)]
         for recording in (plain, late)
     )
     assert [image.stamp_ns for image in late_images] == [image.stamp_ns for image in images]
@@ -191,7 +189,7 @@ def test_frames_before_the_first_imu_sample_are_dropped_and_counted(tmp_path: Pa
     stream = EventStream(open_recording(write_folder(late, tmp_path / "room")))
     events = list(stream)
     assert stream.statistics.dropped_before_imu == 2
-    assert isinstance(events[0], ImuBatch)
+    assert isinstance(events[0], protocol.ImuBatch)
     assert len(frame_sets(events)) == 6
 
 
@@ -205,15 +203,15 @@ def test_gaps_and_saturation_are_reported(tmp_path: Path) -> None:
     gappy = dataclasses.replace(content, imu_ns=content.imu_ns[keep], accel_gyro=values[keep])
     recording = open_recording(write_folder(gappy, tmp_path / "room"))
     events = list(EventStream(recording))
-    flags = np.concatenate([e.is_saturated for e in events if isinstance(e, ImuBatch)])
+    flags = np.concatenate([e.is_saturated for e in events if isinstance(e, protocol.ImuBatch)])
     assert np.flatnonzero(flags).tolist() == [5, 6]
-    report = summarise(recording)
+    report = summary.summarise(recording)
     assert report.imu is not None
     assert (report.imu.gaps, report.imu.saturated_samples) == (1, 2)
     assert report.imu.largest_interval_s == pytest.approx(0.105)
     assert report.imu.first_gap_s == pytest.approx(29 * 0.005)
     assert any("longer than 0.05 s" in note for note in report.notes)
-    relaxed = summarise(recording, StreamOptions(imu_gap_s=0.2))
+    relaxed = summary.summarise(recording, StreamOptions(imu_gap_s=0.2))
     assert relaxed.imu is not None
     assert relaxed.imu.gaps == 0
 
@@ -289,7 +287,7 @@ def test_damaged_folders_are_refused_in_one_line(folder: Path, damage: str) -> N
     harm, message = DAMAGES[damage]
     harm(folder)
     with pytest.raises(MapError) as caught:
-        summarise(open_recording(folder), check_images=True)
+        summary.summarise(open_recording(folder), check_images=True)
     text = str(caught.value)
     assert re.search(message, text), text
     assert "\n" not in text
@@ -315,10 +313,10 @@ def test_a_calibration_with_more_cameras_than_the_folder(folder: Path) -> None:
 
 def test_a_truncated_jpeg_is_refused(tmp_path: Path) -> None:
     folder = write_folder(make_content(), tmp_path / "room", suffix=".jpg")
-    assert summarise(open_recording(folder), check_images=True).checked_images == 16
+    assert summary.summarise(open_recording(folder), check_images=True).checked_images == 16
     _truncate((folder / CAM).with_suffix(".jpg"))
     with pytest.raises(MapError, match=r"\.jpg: the image is truncated"):
-        summarise(open_recording(folder), check_images=True)
+        summary.summarise(open_recording(folder), check_images=True)
 
 
 def test_what_is_no_recording(tmp_path: Path) -> None:
@@ -361,7 +359,7 @@ def test_real_stereo_recording() -> None:
     assert times_ns[0] == 1403636584263555584
     assert accel_gyro[0, 0] == 10.133538333333334
     assert sets[7].images[1].grey().shape == (480, 752)
-    report = summarise(recording, check_images=True)
+    report = summary.summarise(recording, check_images=True)
     assert (report.checked_images, report.frame_sets, report.dropped_before_imu) == (400, 200, 0)
     assert report.imu is not None
     assert report.imu.rate_hz == pytest.approx(200.0, abs=0.01)
@@ -376,7 +374,7 @@ def test_real_irregular_keyframes_without_imu() -> None:
     assert len(frame_sets(events)) == len(events) == 50
     steps_s = np.diff([event.time_ns for event in events]) * 1e-9
     assert steps_s.min() < 1.0 < 7.0 < steps_s.max() < 7.5
-    report = summarise(recording)
+    report = summary.summarise(recording)
     assert report.imu is None
     assert report.notes == ("there is no IMU",)
 
@@ -390,7 +388,7 @@ def _counts_and_memory(folder: Path) -> tuple[int, int, int, int]:
     stream = EventStream(open_recording(folder))
     tracemalloc.start()
     for event in stream:
-        if isinstance(event, FrameSet) and stream.statistics.frame_sets.count % 100 == 0:
+        if isinstance(event, protocol.FrameSet) and stream.statistics.frame_sets.count % 100 == 0:
             assert event.images[1].grey().shape == (480, 752)
     now, peak = tracemalloc.get_traced_memory()
     return stream.statistics.frame_sets.count, stream.statistics.imu.count, now, peak

@@ -11,10 +11,9 @@ import pytest
 
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.bags.listing import bag_info
+from maplab_py.interop.recordings import stream, summary
 from maplab_py.interop.recordings.options import SourceOptions, StreamOptions
 from maplab_py.interop.recordings.reader_choice import open_recording
-from maplab_py.interop.recordings.stream import EventStream
-from maplab_py.interop.recordings.summary import summarise
 from tests.interop.recordings import written
 
 typesys = pytest.importorskip("rosbags.typesys")
@@ -40,7 +39,7 @@ def bag(tmp_path: Path, storage: str = "sqlite3") -> Path:
 
 
 def assert_reads(path: Path, calibrated: SourceOptions) -> None:
-    written.assert_content(list(EventStream(open_recording(path, calibrated))), CONTENT)
+    written.assert_content(list(stream.EventStream(open_recording(path, calibrated))), CONTENT)
 
 
 def database(path: Path) -> sqlite3.Connection:
@@ -217,7 +216,7 @@ def test_images_that_cannot_be_read_are_noted(
     tmp_path: Path, calibrated: SourceOptions, encoding: str, words: str
 ) -> None:
     path = image_bag(tmp_path, encoding=encoding)
-    notes = summarise(open_recording(path, calibrated)).notes
+    notes = summary.summarise(open_recording(path, calibrated)).notes
     assert len(notes) == 2  # of two cameras
     for row, note in enumerate(notes):
         assert f"/cam{row}/image_raw at" in note
@@ -245,7 +244,7 @@ def test_videos_are_noted_and_converted_encodings_named(
         "bayer_rggb8",
     ]
     wide = StreamOptions(nframe_sync_tolerance_ns=1_000_000)
-    notes = summarise(open_recording(tmp_path / "v.bag", calibrated), wide).notes
+    notes = summary.summarise(open_recording(tmp_path / "v.bag", calibrated), wide).notes
     assert notes[0] == "images are converted: camera 1 bayer_rggb8"
     assert "/cam0/image_raw at" in notes[1]
     assert "'h264' is a video" in notes[1]

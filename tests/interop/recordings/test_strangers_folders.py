@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from maplab_py.errors import MapError, UserError
+from maplab_py.interop.recordings import stream, summary
 from maplab_py.interop.recordings.reader_choice import open_recording
-from maplab_py.interop.recordings.stream import EventStream
-from maplab_py.interop.recordings.summary import summarise
 from tests.interop.recordings.written import assert_content, make_content, write_folder
 
 CONTENT = make_content(cameras=1, frames=12)
@@ -56,7 +55,7 @@ def each(pattern: str) -> Callable[[list[str]], list[str]]:
 )
 def test_tables_of_images(tmp_path: Path, header: str, row: str) -> None:
     folder = edited(tmp_path, "cam0", each(row), header=header, encoding="latin-1")
-    assert_content(list(EventStream(open_recording(folder))), CONTENT)
+    assert_content(list(stream.EventStream(open_recording(folder))), CONTENT)
 
 
 @pytest.mark.parametrize("row", ["{t},cam1/data/{name}", "{t},../data/{name}", "{t},{name},0.005"])
@@ -77,7 +76,7 @@ def test_unsorted_rows_are_sorted(tmp_path: Path, table: str, order: str) -> Non
         return [rows[place] for place in places[order]]
 
     recording = open_recording(edited(tmp_path, table, edit))
-    assert_content(list(EventStream(recording)), CONTENT)
+    assert_content(list(stream.EventStream(recording)), CONTENT)
     assert recording.notes[0].endswith(
         f"{table}/data.csv: rows are not in the order of time: they are sorted"
     )
@@ -85,7 +84,7 @@ def test_unsorted_rows_are_sorted(tmp_path: Path, table: str, order: str) -> Non
 
 def test_a_repeated_table_is_no_unsorted_one(tmp_path: Path) -> None:
     folder = edited(tmp_path, "cam0", lambda rows: rows + rows)
-    assert summarise(open_recording(folder)).notes[0].startswith("the clock starts again")
+    assert summary.summarise(open_recording(folder)).notes[0].startswith("the clock starts again")
 
 
 def test_images_with_something_behind_their_end(tmp_path: Path) -> None:
@@ -119,7 +118,7 @@ def test_images_without_partner_are_noted_of_either_camera(tmp_path: Path) -> No
     table = folder / "mav0/cam1/data.csv"
     table.write_text("\n".join(table.read_text().splitlines()[:2]) + "\n")
     notes = " | ".join(
-        note.replace("0.001", "") for note in summarise(open_recording(folder)).notes
+        note.replace("0.001", "") for note in summary.summarise(open_recording(folder)).notes
     )
     assert "imu1: not read: the IMU is imu0" in notes
     assert "of 20 images of camera 0 have no partner in camera 1" in notes

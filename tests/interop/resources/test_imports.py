@@ -10,14 +10,8 @@ import pytest
 
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.ply import PlyCloud, parse_ply, write_ply
-from maplab_py.interop.resources.depth_maps import (
-    DepthImportOptions,
-    encoded_depth,
-    import_depth_maps,
-)
+from maplab_py.interop.resources import depth_maps, matching, point_clouds
 from maplab_py.interop.resources.images import ImageImportOptions, export_images, import_images
-from maplab_py.interop.resources.matching import matched_files
-from maplab_py.interop.resources.point_clouds import import_point_clouds
 from maplab_py.storage.native import load_map, save_map
 from maplab_py.storage.resources.files import missing_files
 from maplab_py.storage.resources.store import ResourceStore, resource_path
@@ -44,10 +38,10 @@ def recorded_image(room: StereoRoom, vi_map: VIMap, frame: int) -> Any:
 def test_files_match_their_nearest_frame_within_the_tolerance() -> None:
     frames = np.array([100, 200, 300, 400])
     files = np.array([90, 104, 215, 290, 306, 500])
-    np.testing.assert_array_equal(matched_files(frames, files, 10), [1, -1, 4, -1])
-    np.testing.assert_array_equal(matched_files(frames, files, 15), [1, 2, 4, -1])
-    np.testing.assert_array_equal(matched_files(frames, files[:0], 15), [-1] * 4)
-    assert len(matched_files(frames[:0], files, 15)) == 0
+    np.testing.assert_array_equal(matching.matched_files(frames, files, 10), [1, -1, 4, -1])
+    np.testing.assert_array_equal(matching.matched_files(frames, files, 15), [1, 2, 4, -1])
+    np.testing.assert_array_equal(matching.matched_files(frames, files[:0], 15), [-1] * 4)
+    assert len(matching.matched_files(frames[:0], files, 15)) == 0
 
 
 def test_images_come_to_their_frames(room: StereoRoom, vi_map: VIMap, tmp_path: Path) -> None:
@@ -125,7 +119,7 @@ def test_wrong_image_folders_are_refused(room: StereoRoom, vi_map: VIMap, tmp_pa
 
 
 def test_depth_maps_keep_their_millimetres(room: StereoRoom, vi_map: VIMap) -> None:
-    with_depth, report = import_depth_maps(vi_map, 0, 1, room.depth(1))
+    with_depth, report = depth_maps.import_depth_maps(vi_map, 0, 1, room.depth(1))
     assert report.attached == len(vi_map.vertices)
     owner = int(with_depth.resources.owner[3])
     assert vi_map.frames.camera_index[owner] == 1
@@ -133,25 +127,27 @@ def test_depth_maps_keep_their_millimetres(room: StereoRoom, vi_map: VIMap) -> N
     depth = ResourceStore(with_depth, Path()).load(3)
     assert depth.dtype == np.uint16
     np.testing.assert_array_equal(depth, cv2.imread(str(file), cv2.IMREAD_UNCHANGED))
-    halves, _ = import_depth_maps(
-        vi_map, 0, 1, room.depth(1), DepthImportOptions(depth_scale=500.0)
+    halves, _ = depth_maps.import_depth_maps(
+        vi_map, 0, 1, room.depth(1), depth_maps.DepthImportOptions(depth_scale=500.0)
     )
     np.testing.assert_array_equal(ResourceStore(halves, Path()).load(3), 2 * depth)
 
 
 def test_depths_that_do_not_fit_are_unknown() -> None:
     depth = np.array([[1.2345, np.nan, np.inf], [-1.0, 65.535, 65.536]])
-    image: Any = cv2.imdecode(np.frombuffer(encoded_depth(depth), np.uint8), cv2.IMREAD_UNCHANGED)
+    image: Any = cv2.imdecode(
+        np.frombuffer(depth_maps.encoded_depth(depth), np.uint8), cv2.IMREAD_UNCHANGED
+    )
     np.testing.assert_array_equal(image, [[1234, 0, 0], [0, 65535, 0]])
 
 
 def test_wrong_depth_files_are_refused(vi_map: VIMap, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="--camera=2: the mission has cameras 0 to 1"):
-        import_depth_maps(vi_map, 0, 2, tmp_path)
+        depth_maps.import_depth_maps(vi_map, 0, 2, tmp_path)
     with pytest.raises(UserError, match=r"--depth_folder=.*there are no files"):
-        import_depth_maps(vi_map, 0, 0, tmp_path)
+        depth_maps.import_depth_maps(vi_map, 0, 0, tmp_path)
     with pytest.raises(UserError, match="cannot be read"):
-        import_depth_maps(vi_map, 0, 0, tmp_path / "nowhere")
+        depth_maps.import_depth_maps(vi_map, 0, 0, tmp_path / "nowhere")
     stamp = int(vi_map.frames.timestamp_ns[0])
     file = tmp_path / f"{stamp}.png"
     for image, message in (
@@ -160,13 +156,13 @@ def test_wrong_depth_files_are_refused(vi_map: VIMap, tmp_path: Path) -> None:
     ):
         cv2.imwrite(str(file), image)
         with pytest.raises(MapError, match=message):
-            import_depth_maps(vi_map, 0, 0, tmp_path)
+            depth_maps.import_depth_maps(vi_map, 0, 0, tmp_path)
     file.write_bytes(b"")
     with pytest.raises(MapError, match="damaged"):
-        import_depth_maps(vi_map, 0, 0, tmp_path)
+        depth_maps.import_depth_maps(vi_map, 0, 0, tmp_path)
     file.rename(tmp_path / "first.png")
     with pytest.raises(UserError, match="time stamp in nanoseconds"):
-        import_depth_maps(vi_map, 0, 0, tmp_path)
+        depth_maps.import_depth_maps(vi_map, 0, 0, tmp_path)
 
 
 POINTS = np.array([[0.0, 0.0, 1.0], [1.0, -2.0, 3.0]])
@@ -183,7 +179,7 @@ def test_clouds_belong_to_a_sensor_at_their_time(vi_map: VIMap, tmp_path: Path) 
     write_ply(PlyCloud(POINTS, np.full((2, 3), 9, np.uint8)), tmp_path / f"{times[1]}.ply")
     (tmp_path / f"{times[2]}.pcd").write_text(PCD)
     write_ply(PlyCloud(POINTS), tmp_path / "12345.ply")
-    with_clouds, report = import_point_clouds(vi_map, 0, tmp_path, sensor[:6])
+    with_clouds, report = point_clouds.import_point_clouds(vi_map, 0, tmp_path, sensor[:6])
     assert report.attached == 3
     assert report.notes == ("1 files are of times outside the mission",)
     assert report.resource_types == ("color_point_cloud", "point_cloud", "point_cloud_w_intensity")
@@ -198,7 +194,7 @@ def test_clouds_belong_to_a_sensor_at_their_time(vi_map: VIMap, tmp_path: Path) 
     cloud = parse_ply(store.load(int(rows[2])), "cloud")
     np.testing.assert_array_equal(cloud.p, POINTS)
     np.testing.assert_array_equal(cloud.intensity, [5.0, 6.0])
-    _, again = import_point_clouds(with_clouds, 0, tmp_path, sensor)
+    _, again = point_clouds.import_point_clouds(with_clouds, 0, tmp_path, sensor)
     assert (again.attached, again.frames_that_had_some) == (0, 3)
 
 
@@ -210,7 +206,7 @@ def test_empty_clouds_do_not_stop_the_others(vi_map: VIMap, tmp_path: Path) -> N
         write_ply(
             PlyCloud(p, intensity=np.arange(len(p), dtype=np.float64)), tmp_path / f"{time_ns}.ply"
         )
-    attached, report = import_point_clouds(vi_map, 0, tmp_path, sensor)
+    attached, report = point_clouds.import_point_clouds(vi_map, 0, tmp_path, sensor)
     assert (report.attached, report.frames_that_had_some) == (2, 0)
     assert report.notes == ("1 cloud without finite points left out",)
     assert sorted(attached.resources.timestamp_ns[-2:].tolist()) == times[1:]
@@ -221,17 +217,17 @@ def test_wrong_clouds_are_refused(vi_map: VIMap, tmp_path: Path) -> None:
     file = tmp_path / f"{vi_map.vertices.timestamp_ns[1]}.ply"
     write_ply(PlyCloud(np.zeros((0, 3))), file)
     with pytest.raises(UserError, match="no lidar"):
-        import_point_clouds(vi_map, 0, tmp_path)
+        point_clouds.import_point_clouds(vi_map, 0, tmp_path)
     with pytest.raises(UserError, match="--sensor_id=zz is unknown"):
-        import_point_clouds(vi_map, 0, tmp_path, "zz")
+        point_clouds.import_point_clouds(vi_map, 0, tmp_path, "zz")
     with pytest.raises(MapError, match="is empty"):
-        import_point_clouds(vi_map, 0, tmp_path, sensor)
+        point_clouds.import_point_clouds(vi_map, 0, tmp_path, sensor)
     write_ply(PlyCloud(np.full((1, 3), np.nan)), file)
     with pytest.raises(MapError, match="not finite"):
-        import_point_clouds(vi_map, 0, tmp_path, sensor)
+        point_clouds.import_point_clouds(vi_map, 0, tmp_path, sensor)
     file.write_bytes(b"ply\nformat")
     with pytest.raises(MapError, match="not a PLY file"):
-        import_point_clouds(vi_map, 0, tmp_path, sensor)
+        point_clouds.import_point_clouds(vi_map, 0, tmp_path, sensor)
     file.rename(tmp_path / "17.ply")
     with pytest.raises(UserError, match="no stamp is within the mission"):
-        import_point_clouds(vi_map, 0, tmp_path, sensor)
+        point_clouds.import_point_clouds(vi_map, 0, tmp_path, sensor)

@@ -7,8 +7,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, U8
 from maplab_py.geometry import se3, so3
-from maplab_py.sensors import Camera, Distortion, Projection
-from maplab_py.sensors.projection import back_project, project
+from maplab_py.sensors import Camera, Distortion, Projection, projection
 from maplab_py.simulation.imaging import pixel_rays
 from maplab_py.simulation.ray_caster import RayCaster, painted_boxes
 from maplab_py.simulation.scenario import ImageOptions
@@ -82,13 +81,13 @@ def points_at(T_G_C: F64, uv_px: F64) -> F64:
     du, dv = u - u0, v - v0
     z = (1 - dv) * ((1 - du) * depth[v0, u0] + du * depth[v0, u0 + 1])
     z += dv * ((1 - du) * depth[v0 + 1, u0] + du * depth[v0 + 1, u0 + 1])
-    ray, exists = back_project(camera(), uv_px)
+    ray, exists = projection.back_project(camera(), uv_px)
     assert exists.all()
     return se3.transform(T_G_C, ray / ray[:, 2:] * z[:, None])
 
 
 def pixels_at(T_G_C: F64, p_G: F64) -> F64:
-    return project(camera(), se3.transform(se3.inverse(T_G_C), p_G))[0]
+    return projection.project(camera(), se3.transform(se3.inverse(T_G_C), p_G))[0]
 
 
 def pose(x: float = 0.0, y: float = 0.0, yaw: float = 0.0, roll: float = 0.0) -> F64:

@@ -6,12 +6,9 @@ import numpy as np
 import pytest
 
 from maplab_py.array_types import F64, I64
-from maplab_py.geometry import se3, so3
-from maplab_py.geometry.interpolation import nearest_rows
+from maplab_py.geometry import interpolation, se3, so3
+from maplab_py.interop.recordings import protocol, reader_choice, stream
 from maplab_py.interop.recordings.options import SourceOptions
-from maplab_py.interop.recordings.protocol import FrameSet, RecordedSensors
-from maplab_py.interop.recordings.reader_choice import open_recording
-from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.interop.trajectories import Trajectory, read_trajectory
 from maplab_py.sensors.projection import back_project
 from maplab_py.vision.tracking.tracker import FrameTracker
@@ -28,19 +25,19 @@ def truth() -> Trajectory:
 
 
 def true_poses(times_ns: I64) -> F64:
-    return truth().T_R_B[nearest_rows(truth().times_ns, times_ns)]
+    return truth().T_R_B[interpolation.nearest_rows(truth().times_ns, times_ns)]
 
 
 @cache
-def tracked(cameras: str, frames: int) -> tuple[RecordedSensors, list[TrackedImages]]:
+def tracked(cameras: str, frames: int) -> tuple[protocol.RecordedSensors, list[TrackedImages]]:
     """Track with the true turn in place of the gyroscope's."""
     options = SourceOptions(rovio_active_camera_indices=cameras)
-    recording = open_recording(shared_data(FOLDER), options)
+    recording = reader_choice.open_recording(shared_data(FOLDER), options)
     device = recording.device
     tracker = FrameTracker(device.cameras, device.T_I_C)
     result: list[TrackedImages] = []
-    for event in EventStream(recording):
-        if not isinstance(event, FrameSet):
+    for event in stream.EventStream(recording):
+        if not isinstance(event, protocol.FrameSet):
             continue
         R_I0_I1 = None
         if result:
@@ -54,7 +51,7 @@ def tracked(cameras: str, frames: int) -> tuple[RecordedSensors, list[TrackedIma
 
 
 def distance_to_epipolar_lines_px(
-    device: RecordedSensors, images: list[TrackedImages], camera: int, gap: int
+    device: protocol.RecordedSensors, images: list[TrackedImages], camera: int, gap: int
 ) -> F64:
     """Compare keypoints of the same track in images so many apart with the true motion."""
     T_M_C = se3.compose(true_poses(np.array([i.time_ns for i in images])), device.T_I_C[camera])
