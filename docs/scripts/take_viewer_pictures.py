@@ -89,6 +89,9 @@ def _demo(folder: Path) -> None:
             viewer.set_layer("landmarks", True)
             viewer.look_at_everything()
             _take(page, "viewer_side_by_side.png")
+            session.run("visualize_difference", with_map_key="odometry", swipe=True)
+            viewer.look_at_everything()
+            _take(page, "viewer_swipe.png")
 
 
 def _recording(folder: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Literal
 
 import numpy as np
 
@@ -35,6 +36,11 @@ _MAX_RAYS = 60_000
 _OUTLINE_POINTS = 1500
 
 
+Arrangement = Literal["over", "beside", "swipe"]
+"""Another map over the map in grey, beside it, or left of a line that the page swipes over both."""
+_WHERE = {"over": "in grey", "beside": "beside it", "swipe": "left of the line"}
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Subject:
     """Subject of a view: a map and the references to compare it with."""
@@ -44,7 +50,7 @@ class Subject:
     options: VisualizationOptions = dataclasses.field(default_factory=VisualizationOptions)
     other: VIMap | None = None
     other_name: str = "before"
-    side_by_side: bool = False
+    arrangement: Arrangement = "over"  # of the other map
     truth: Trajectory | None = None
     clouds: tuple[Cloud, ...] = ()
     segments: MarkedSegments | None = None
@@ -64,9 +70,19 @@ class Subject:
 
     @property
     def place(self) -> int:
-        """Place in the history of what is drawn, -1 = it has none."""
-        shown = self.shown
+        """Place in the history of what is drawn, left of a swipe line if there is one; -1 = it has none."""
+        shown = self.shown if self.other is None or self.arrangement != "swipe" else self.other
         return next((i for i, state in enumerate(self.history) if state.vi_map is shown), -1)
+
+    def at_state(self, place: int, *, swipes: bool) -> Subject:
+        """Return the subject with a state of the history in place of the map, or left of a swipe line."""
+        state = self.history[place]
+        if swipes:
+            name = state.command or "before the first command"
+            return self.replace(state=-1, other=state.vi_map, other_name=name, arrangement="swipe")
+        if self.arrangement == "swipe":
+            return self.replace(state=place, other=None, arrangement="over")
+        return self.replace(state=place)
 
     def replace(self, **changes: object) -> Subject:
         """Return the subject with some of it exchanged."""
@@ -93,9 +109,12 @@ def make_checked_drawing(subject: Subject) -> Drawing:
     if not len(subject.shown.vertices):
         raise UserError(f"map '{subject.title}' has no vertices: there is nothing to show")
     drawing = make_drawing(subject.shown, subject.options)
-    if subject.shown is not subject.vi_map:
-        return drawing  # its vertices may have other rows
-    return dataclasses.replace(drawing, images=subject.images)
+    drawing = dataclasses.replace(drawing, images=subject.images)
+    # the vertices of another state may have other rows
+    images = drawing.of_state(subject.shown).images
+    return (
+        drawing if subject.shown is subject.vi_map else dataclasses.replace(drawing, images=images)
+    )
 
 
 def scene_of(drawing: Drawing, subject: Subject) -> Scene:
@@ -123,12 +142,15 @@ def scene_of(drawing: Drawing, subject: Subject) -> Scene:
         layers += paths.localized_layers(drawing, subject.localized)
     if subject.truth is not None:
         layers += references.ground_truth(drawing, subject.truth)
-    if subject.other is not None and subject.side_by_side:
-        layers += comparison.beside(drawing, subject.other, (subject.title, subject.other_name))
-    elif subject.other is not None:
-        layers += references.compared(drawing, subject.other)
+    if subject.other is not None:
+        layers += _layers_of_other(drawing, subject, subject.other)
     remembered, unreadable = closures.recorded_closures(drawing)
     layers += remembered
+    if subject.options.coverage:
+        from maplab_py.viewer.layers.coverage import coverage_layers
+
+        more, unknown = coverage_layers(drawing)
+        layers, unreadable = layers + more, unreadable + unknown
     added, problems = plugin_layers(drawing, {layer.name for layer in layers})
     layers += added
     layers = [_with_visibility(layer, subject) for layer in layers if layer.total]
@@ -138,13 +160,21 @@ def scene_of(drawing: Drawing, subject: Subject) -> Scene:
     notes = [note for layer in layers if not layer.choices for note in layer.notes]
     notes = [*filter(None, [subject.note]), *notes, *unreadable, *problems]
     if subject.other is not None:
-        extent = _with_reference(drawing, subject.other, side_by_side=subject.side_by_side)
-        where = "beside it" if subject.side_by_side else "in grey"
-        notes.insert(0, f"{where}: {subject.other_name}")
+        is_beside = subject.arrangement == "beside"
+        extent = _with_reference(drawing, subject.other, side_by_side=is_beside)
+        notes.insert(0, f"{_WHERE[subject.arrangement]}: {subject.other_name}")
     return Scene(
         subject.title, tuple(layers), mission_entries(drawing), extent, drawing.origin_G,
         notes=tuple(notes),
     )  # fmt: skip
+
+
+def _layers_of_other(drawing: Drawing, subject: Subject, other: VIMap) -> list[Layer]:
+    if subject.arrangement == "beside":
+        return comparison.beside(drawing, other, (subject.title, subject.other_name))
+    if subject.arrangement == "swipe":
+        return comparison.swiped(drawing, other)
+    return references.compared(drawing, other)
 
 
 def _with_reference(drawing: Drawing, other: VIMap, *, side_by_side: bool) -> Extent:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.array_types import F32, F64, I64, U8, U64
+from maplab_py.array_types import F32, F64, I64, U8, U64, Mask
 from maplab_py.geometry import so3
 from maplab_py.viewer import colours
 from maplab_py.viewer.options import VisualizationOptions
@@ -24,6 +24,19 @@ ImageOf = Callable[[int], "U8 | None"]
 def no_image(row: int) -> None:  # noqa: ARG001
     """Say that a vertex has no image."""
     return
+
+
+@runtime_checkable
+class MapImages(Protocol):
+    """Images of the vertices of a map that other states of it share."""
+
+    def of_map(self, vi_map: VIMap) -> ImageOf:
+        """Return the images of another state of the map."""
+        ...
+
+    def pixels(self) -> tuple[U8, Mask]:
+        """Return the colours (L, 3) of landmarks, and which of them are known (L,)."""
+        ...
 
 
 _OUTLINE_POINTS = 1500
@@ -40,6 +53,11 @@ class Drawing:
     origin_G: F64  # (3,)
     extent: Extent
     images: ImageOf = no_image
+
+    def of_state(self, vi_map: VIMap) -> Drawing:
+        """Return the drawing of another state of the map, or of another map, where this one is."""
+        images = self.images.of_map(vi_map) if isinstance(self.images, MapImages) else no_image
+        return Drawing(vi_map, self.options, self.origin_G, self.extent, images)
 
     @cached_property
     def mission_ids(self) -> list[str]:

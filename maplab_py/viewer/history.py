@@ -122,8 +122,17 @@ def state_layers(drawing: Drawing, state: State, states: int) -> tuple[Layer, ..
     """Return paths and landmarks of one of several states, where the drawing has its origin."""
     limit = min(drawing.options.max_points, max(1, _MAX_POINTS // states))
     options = dataclasses.replace(drawing.options, max_points=limit)
-    other = Drawing(state.vi_map, options, drawing.origin_G, drawing.extent)
+    other = dataclasses.replace(drawing.of_state(state.vi_map), options=options)
     return trajectories(other), landmarks(other)[0]
+
+
+def state_facts(curves: Sequence[Curve], shown: int) -> list[str]:
+    """Return a line with each error of a state that is known."""
+    return [
+        f"{curve.title}: {curve.values[shown]:.{curve.decimals}f} {curve.unit}"
+        for curve in curves
+        if np.isfinite(curve.values[shown])
+    ]
 
 
 _WIDTH, _HEIGHT = 240.0, 26.0

@@ -48,6 +48,8 @@ class VisualizationOptions(Options, prefix="vis_"):
     """Colour landmarks by the camera of the frame that observed them first."""
     color_landmarks_by_pixels: bool = False
     """Colour landmarks by the pixels of the images that the map keeps."""
+    color_paths_by_time: bool = False
+    """Colour trajectories by the time since the beginning of their mission."""
     color_only_missions: str = ""
     """Colour the landmarks of these missions alone by the rule, the others by mission: ids or their
     beginnings, separated by commas; empty = all."""
@@ -74,7 +76,7 @@ class VisualizationOptions(Options, prefix="vis_"):
     """This many observers, and more, have the last colour."""
     landmarks_min_number_of_observer_missions: int = 0
     """Leave out landmarks that fewer missions observe."""
-    max_points: int = option(300_000, ge=1)
+    max_points: int = option(1_000_000, ge=1)
     """Draw at most this many landmarks, and as many points of dense clouds."""
     max_refused_closures: int = option(200, ge=0)
     """Draw at most this many refused closures, those nearest to acceptance first."""
@@ -84,8 +86,10 @@ class VisualizationOptions(Options, prefix="vis_"):
     """Show the covariance of the position of each loop closure edge as an ellipsoid."""
     abs_6dof_constraint_covariances: bool = False
     """Show the covariance of the position of each absolute pose as an ellipsoid."""
+    coverage: bool = False
+    """Show the uncertainty of the path as a tube, poorly seen volume as fog, and where to walk next."""
     covariance_scale: float = option(3.0, gt=0)
-    """Half axes of the ellipsoids of covariances, in standard deviations."""
+    """Half axes of the ellipsoids and tubes of covariances, in standard deviations."""
     scale: float = option(1.0, gt=0)
     """Size of points, frusta and axes."""
     frustum_every_nth: int = 0

@@ -209,6 +209,7 @@ class VertexImages:
         self._row_of_vertex = _first_of_vertices(vi_map, (name,) if name else IMAGE_TYPES)
         self._frame_of_row = vi_map.resources.owner
         self._depth_of_vertex: dict[int, int] = {}
+        self._pixels: tuple[U8, Mask] | None = None
         if with_depth:
             self._depth_of_vertex = _first_of_vertices(vi_map, DEPTH_TYPES)
 
@@ -237,13 +238,21 @@ class VertexImages:
     def of_map(self, vi_map: VIMap) -> VertexImages:
         """Return the images of another state of the map, whose vertices may have other rows."""
         with_depth = bool(self._depth_of_vertex)
-        return VertexImages(vi_map, self._folder, self._name, with_depth=with_depth)
+        images = VertexImages(vi_map, self._folder, self._name, with_depth=with_depth)
+        if vi_map.keypoints.landmark is self._vi_map.keypoints.landmark:
+            images._pixels = self._pixels
+        return images
 
     def pixels(self) -> tuple[U8, Mask]:
         """Return colours (L, 3) of landmarks where images show them, and which landmarks (L,) have one.
 
         Of many images every n-th is read: most landmarks are in several.
         """
+        if self._pixels is None:
+            self._pixels = self._read_pixels()
+        return self._pixels
+
+    def _read_pixels(self) -> tuple[U8, Mask]:
         vi_map = self._vi_map
         vertices = np.array(sorted(self._row_of_vertex), dtype=np.int64)
         vertices = vertices[:: max(1, -(-len(vertices) // _MAX_PIXEL_IMAGES))]

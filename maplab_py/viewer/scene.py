@@ -75,6 +75,7 @@ class Mesh:
     p: F32  # (N, 3) [m]
     faces: NDArray[np.int32]  # (F, 3)
     colours: U8  # (N, 3), or (3,) of the whole mesh
+    opacity: float = 1.0  # of a mesh with a colour at each corner
 
     def __len__(self) -> int:
         return len(self.faces)

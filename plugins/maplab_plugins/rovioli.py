@@ -69,6 +69,7 @@ def rovioli(
     calibration: OnlineCalibrationOptions = OnlineCalibrationOptions(),
     map_key: str = "",
     rovioli_visualize_map: bool = False,
+    keep_viewer: bool = False,
     map_publish_interval_s: float = 2.0,
 ) -> MappingReport:
     """Make a map from a recording: camera images and IMU samples in, a map with landmarks out.
@@ -85,6 +86,7 @@ def rovioli(
         datasource_folder: EuRoC or TUM-VI folder, ROS bag, or map folder.
         map_key: Key of the map in memory; empty = the name of --save_map_folder, or rovioli.
         rovioli_visualize_map: Show the map, its landmarks and the image in the viewer as they grow.
+        keep_viewer: Show the map likewise, and wait at the end until Ctrl-C.
         map_publish_interval_s: Time between two pictures in the viewer.
     """
     from maplab_plugins.live import live_run
@@ -95,7 +97,9 @@ def rovioli(
     _check_output(run.output)
     folder = run.output.save_map_folder
     key = _new_key(context, map_key, folder)
-    pictures = _pictures(context, key, map_publish_interval_s) if rovioli_visualize_map else None
+    pictures = None
+    if rovioli_visualize_map or keep_viewer:
+        pictures = _pictures(context, key, map_publish_interval_s)
     is_live = data.type in TRANSPORTS
     # runs of hours: the map is at the server, and what is there need not stay in memory
     writer = _writer(submaps, forgets=is_live and folder is None)
@@ -135,6 +139,8 @@ def rovioli(
     _keep_map(context, key, finished, is_at_server=is_at_server)
     if pictures is not None:
         pictures.after_run(finished)
+    if pictures is not None and keep_viewer:
+        pictures.keep(context)
     return finished.report
 
 
@@ -301,6 +307,12 @@ class _Pictures:
         note = "finished; in memory only: save" if folder is None else f"saved: load {folder}"
         self._viewer.follow(Subject(vi_map, self._title, note=note))
         self._viewer.wait(_SECONDS_TO_DRAW)
+
+    def keep(self, context: CommandContext) -> None:
+        """Wait until Ctrl-C."""
+        from maplab_plugins.visualization.output import keep
+
+        keep(context, self._viewer)
 
 
 def _pictures(context: CommandContext, title: str, interval_s: float) -> _Pictures:

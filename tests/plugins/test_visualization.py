@@ -114,14 +114,17 @@ def test_difference_to_a_snapshot_and_to_the_state_before(session: Session) -> N
     T[:, 6] += 0.25
     moved = session.vi_map.replace(vertices=session.vi_map.vertices.replace(T_M_I=T))
     session.maps.update(session.maps.selected.with_value(moved, "moving"))
-    for flags in ({}, {"with_snapshot": "before"}, {"side_by_side": True}):
+    for flags in ({}, {"with_snapshot": "before"}, {"side_by_side": True}, {"swipe": True}):
         report = session.run("visualize_difference", **flags)
         assert report.vertices == 12
         assert report.mean_m == pytest.approx(0.25)
         assert report.largest_m == pytest.approx(0.25)
         assert report.not_in_both == 0
         names = _layers(report.view)
-        assert ("Displacement" in names) != ("side_by_side" in flags)
+        assert ("Displacement" in names) == (not {"side_by_side", "swipe"} & set(flags))
+        assert ("Landmarks, left" in names) == ("swipe" in flags)
+    with pytest.raises(UserError, match="not both"):
+        session.run("visualize_difference", side_by_side=True, swipe=True)
     with pytest.raises(UserError, match=r"no snapshot 'after' .*before"):
         session.run("visualize_difference", with_snapshot="after")
     session.maps.add("stranger", walk_map(seed=9), select=False)

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import io
+
 import numpy as np
 import pytest
 from maplab_plugins.visualization.following import states_of
+from PIL import Image
 
 from maplab_py.console.session.maps import MapEntry
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.viewer.building import Subject, build_scene
+from maplab_py.viewer.display.animation import evenly_spread, gif, with_caption
 from maplab_py.viewer.drawing import make_drawing
-from maplab_py.viewer.history import State, error_curves, history_chart, state_layers
+from maplab_py.viewer.history import MAX_STATES, State, error_curves, history_chart, state_layers
 from maplab_py.viewer.options import VisualizationOptions
+from maplab_py.viewer.scene import Segments
 from maplab_py.vimap import VIMap
 from tests.vimap.builders import walk_map
 
@@ -52,6 +57,36 @@ def test_a_state_is_drawn_where_the_map_has_its_origin() -> None:
     assert (subject.place, subject.replace(state=0).place) == (1, 0)
     past, now = (build_scene(subject.replace(state=place)) for place in (0, -1))
     assert past.extent.radius_m > now.extent.radius_m
+
+
+def test_of_many_states_an_animation_has_some_that_are_spread_over_all() -> None:
+    assert evenly_spread(3).tolist() == [0, 1, 2]
+    chosen = evenly_spread(500)
+    assert (len(chosen), chosen[0], chosen[-1]) == (MAX_STATES, 0, 499)
+    assert np.ptp(np.diff(chosen)) <= 1
+
+
+def test_an_animation_shows_its_frames_again_and_again() -> None:
+    plain = np.full((60, 90, 3), 255, dtype=np.uint8)
+    frames = [with_caption(plain, (f"{k} of 3: relax",), is_dark=False) for k in range(3)]
+    assert all(0 < np.count_nonzero(frame != plain) < 0.2 * plain.size for frame in frames)
+    with Image.open(io.BytesIO(gif(frames))) as picture:
+        assert (picture.n_frames, picture.size, picture.info["loop"]) == (3, (90, 60), 0)
+        assert picture.info["duration"] == 1200
+
+
+def test_a_state_is_swiped_over_the_map() -> None:
+    history = (State("", _bent(MAP, 5.0)), State("relax", MAP))
+    swiped = Subject(MAP, history=history).at_state(0, swipes=True)
+    assert (swiped.place, swiped.shown) == (0, MAP)
+    scene = build_scene(swiped)
+    path, other = (scene.layer(f"{side}trajectories").parts for side in ("", "swiped_"))
+    p = np.concatenate([part.ends for part in other.values() if isinstance(part, Segments)])
+    np.testing.assert_allclose(p[:, 0], history[0].vi_map.T_G_I[:-1, 4:], atol=1e-4)
+    assert len(path) == len(other) == 1
+    assert scene.notes[0] == "left of the line: before the first command"
+    back = swiped.at_state(1, swipes=False)
+    assert (back.place, back.other, back.arrangement) == (1, None, "over")
 
 
 def test_the_history_is_what_undo_and_redo_lead_to() -> None:

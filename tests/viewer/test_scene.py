@@ -368,7 +368,7 @@ def test_comparison_shows_by_how_much_vertices_moved(two_missions: VIMap) -> Non
     p = scene.layer("reference_trajectories").parts[""]
     assert isinstance(p, Segments)
     np.testing.assert_allclose(p.ends[0, 0], two_missions.T_G_I[0, 4:], atol=1e-5)
-    beside = _scene(moved, other=two_missions, side_by_side=True)
+    beside = _scene(moved, other=two_missions, arrangement="beside")
     assert "displacements" not in beside.names
 
 

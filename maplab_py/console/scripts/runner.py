@@ -64,6 +64,7 @@ class Runner:
         self._rescue: Rescue | None = None  # of a script
         self._plan: Plan | None = None
         terminal.mission_names = lambda: session.mission_names
+        terminal.page_of_ids = lambda: session.marks.get("viewer", "")
 
     def run_text(self, text: str, *, keep_going: bool = False) -> Status:
         """Run the commands of a text; stop at the first that fails unless told to go on.

@@ -192,6 +192,7 @@ class ConsoleTerminal:
         self.is_prompt = False  # a user reads the output directly
         self.position = ""  # of the running command in its script, before its name in the bar
         self.mission_names: Callable[[], Mapping[str, str]] = dict  # by id
+        self.page_of_ids: Callable[[], str] = str  # address of the viewer; empty = none runs
         self._transcript: TextIO | None = None
         self._out: IO[str] | None = None  # instead of standard output
         self._progresses: list[TerminalProgress] = []  # of the running command and inner ones
@@ -252,7 +253,7 @@ class ConsoleTerminal:
             if self.as_json:
                 render_json(report, command, seconds, out)
             elif blocks_of(report) and not self._page(report):
-                render(report, out, self.mission_names())
+                render(report, out, self.mission_names(), self.page_of_ids())
         if self._transcript is not None:
             blocks = with_names(blocks_of(report), self.mission_names())
             self._copy("\n\n".join(plain_text(block) for block in blocks))
@@ -360,7 +361,7 @@ class ConsoleTerminal:
     def _page(self, report: Report) -> bool:
         if not self.is_prompt or self._out is not None:
             return False
-        return page(rendered(report, sys.stdout, self.mission_names()))
+        return page(rendered(report, sys.stdout, self.mission_names(), self.page_of_ids()))
 
     def _hide_progress(self) -> None:
         for progress in self._progresses:

@@ -20,24 +20,31 @@ def wants_colour(stream: IO[str]) -> bool:
     return stream.isatty() and not os.environ.get("NO_COLOR") and os.environ.get("TERM") != "dumb"
 
 
-def render(report: Report, stream: IO[str], names: Mapping[str, str] | None = None) -> None:
+def render(
+    report: Report, stream: IO[str], names: Mapping[str, str] | None = None, page: str = ""
+) -> None:
     """Print a report as text; see `rendered`."""
-    stream.write(rendered(report, stream, names))
+    stream.write(rendered(report, stream, names, page))
     stream.flush()
 
 
-def rendered(report: Report, stream: IO[str], names: Mapping[str, str] | None = None) -> str:
+def rendered(
+    report: Report, stream: IO[str], names: Mapping[str, str] | None = None, page: str = ""
+) -> str:
     """Return a report as text for a stream: fitted to a terminal, else at full width.
 
     Args:
         report: What to print.
         stream: Where it goes.
         names: Names of missions by their ids, which they replace.
+        page: Address of a page that shows what ids mean; empty = there is none.
     """
     blocks = with_names(blocks_of(report), names or {})
     if stream.isatty():
         width, coloured = shutil.get_terminal_size().columns, wants_colour(stream)
         texts = [drawn(block, width, coloured=coloured) for block in blocks]
+        if page and coloured:
+            texts = [with_links(text, page) for text in texts]
     else:
         texts = [plain_text(block) for block in blocks]
     return "".join(("\n" if number else "") + text + "\n" for number, text in enumerate(texts))
@@ -77,6 +84,17 @@ SHORT_ID_DIGITS = 8
 _ID_ITSELF = "id"
 """A value of this name stays an id."""
 _ID = re.compile(rf"\b[0-9a-f]{{{SHORT_ID_DIGITS}}}(?:[0-9a-f]{{24}})?\b")
+
+
+_LINKED_ID = re.compile(rf"(?=\d*[a-f]){_ID.pattern}")
+"""An id that is no number of eight digits."""
+
+
+def with_links(text: str, page: str) -> str:
+    """Return a text whose ids are links (OSC 8) that let an open page of the viewer show them."""
+    return _LINKED_ID.sub(
+        lambda match: f"\x1b]8;;{page}/go/{match[0]}\x1b\\{match[0]}\x1b]8;;\x1b\\", text
+    )
 
 
 def names_by_id(missions: Iterable[tuple[str, str]]) -> dict[str, str]:

@@ -6,6 +6,7 @@ import dataclasses
 import threading
 import zlib
 from collections.abc import Callable
+from html import escape
 from typing import Any, Protocol
 from urllib.parse import parse_qsl, urlencode
 
@@ -23,6 +24,7 @@ KEY = "maplab_link"
 """Item of local storage in whose place `page.js` reads and writes the page's address."""
 MAX_CHARACTERS = 1500
 _FARTHEST_M, _NEAREST_M = 1e8, 1e-3
+_TEXT = "<!doctype html><title>maplab</title><p style='font-family:system-ui'>{}</p>"
 _ANSWER_S = 300.0
 """Longest wait for a page that is opened to tell its address."""
 
@@ -115,6 +117,7 @@ class Links:
         say: Callable[[str], None],
     ) -> None:
         """Add the button to a folder of the panel."""
+        self._server = server
         self._view = view
         self._lock = lock
         with folder:
@@ -138,6 +141,24 @@ class Links:
             return
         client.local_storage.set_item(KEY, text)
         _tell(client, "copied: it is the address of this page, too")
+
+    def go(self, id_: str) -> str:
+        """Let all pages show what an id means; return a page that says so, or becomes the first one."""
+        try:
+            with self._lock:
+                self._view.fly_to(id_)
+                drawing, picked = self._view.drawing, self._view.selection.picked
+                if self._server.get_clients() or picked is None:
+                    return _TEXT.format(f"{id_[:8]} is selected in the open page of the viewer.")
+                distance_m = 0.25 * drawing.extent.radius_m
+                position = picked.p + distance_m * np.array([0.0, -0.8, 0.6])
+                camera = np.stack([position, picked.p]) + drawing.origin_G
+                layers = tuple(sorted(self._view.visible_layers))
+                picked_id = id_of(drawing.vi_map, picked)
+                text = link_text(SharedView(map_code(drawing), camera, layers, picked_id))
+        except UserError as error:
+            return _TEXT.format(escape(str(error)))
+        return f"<script>location.replace('/#{text}')</script>"
 
     def restore(self, client: Any) -> None:
         """Show what the address of a page that is opened says; the page is told what is wrong with it."""

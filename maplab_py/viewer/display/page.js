@@ -1,7 +1,31 @@
+// Renderer, scene and camera of viser's page; null before there are any.
+const viewerState = () => {
+  let found = null;
+  const root = window.__viserMutable && window.__viserMutable.scene;
+  if (root) {
+    root.traverse((node) => {
+      if (!found && node.__r3f && node.__r3f.root) found = node.__r3f.root;
+    });
+  }
+  return found && found.getState();
+};
+
+// Lets a function draw in the place of the renderer, which it is given with the renderer's own function.
+const drawBy = (make) => {
+  const wait = setInterval(() => {
+    const state = viewerState();
+    if (!state) return;
+    clearInterval(wait);
+    const gl = state.gl;
+    const render = gl.render;
+    gl.render = (...scene) => make(gl, () => render.apply(gl, scene));
+  }, 20);
+};
+
 // Keeps the view fluent where drawing is slow: while the camera moves, fewer points are drawn with
 // fewer pixels, without the grid, and with thin lines; the full picture is drawn again as soon as it
 // rests. Where a program draws instead of a GPU this begins with the first movement, elsewhere once
-// frames are slow.
+// frames are slow. Software draws a part of the largest clouds at rest, too.
 // Points arrive in a shuffled order, so that the first ones of a cloud are spread over all of it.
 (() => {
   const SLOW_MS = 40; // a page that needs longer for a frame draws less
@@ -10,6 +34,9 @@
   const STARTING_MS = 1500;
   const FEWEST_POINTS = 6000;
   const FIRST_POINTS = 20000; // in software, before frames are measured
+  const REST_POINTS = 300000; // in software, while the camera rests
+  const SMALL_MESH = 60000; // triangles, drawn as they are
+  const CELLS = 80; // across a mesh that is drawn coarsely
   const LARGEST_FACTOR = 2; // on the size of the points that stand for all
   const SMALL_CLOUD = 2000; // drawn as it is
   const FAINT_LAYER = "/map/refused_closures/";
@@ -27,16 +54,9 @@
   let isWatching = false;
   let isCapturing = false;
 
-  const store = () => {
-    let found = null;
-    window.__viserMutable.scene.traverse((node) => {
-      if (!found && node.__r3f && node.__r3f.root) found = node.__r3f.root;
-    });
-    return found && found.getState();
-  };
   const drawsInSoftware = () => {
-    if (isSoftware === null && store()) {
-      const context = store().gl.getContext();
+    if (isSoftware === null && viewerState()) {
+      const context = viewerState().gl.getContext();
       const info = context.getExtension("WEBGL_debug_renderer_info");
       const name = context.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : context.RENDERER);
       isSoftware = SOFTWARE.test(name);
@@ -58,6 +78,50 @@
     cloud.geometry.setDrawRange(0, part < 1 ? Math.ceil(part * count) : Infinity);
     cloud.onBeforeRender = part < 1 && scale ? () => (scale.value *= factor) : () => {};
     cloud.onAfterRender = part < 1 && scale ? () => (scale.value /= factor) : () => {};
+  };
+  const drawRest = () => {
+    const all = clouds();
+    const total = all.reduce((sum, [, count]) => sum + count, 0);
+    const part = drawsInSoftware() && !isCapturing ? Math.min(1, REST_POINTS / Math.max(total, 1)) : 1;
+    all.forEach(([cloud, count]) => drawPart(cloud, count, part));
+  };
+  // a cloud that arrives is limited before its first frame
+  drawBy((gl, draw) => {
+    if (!isReduced && drawsInSoftware()) drawRest();
+    draw();
+  });
+
+  // The triangles between the cells of a grid, each cell at the first of its corners.
+  const coarseIndex = (geometry) => {
+    const { index, attributes } = geometry;
+    geometry.computeBoundingBox();
+    const { min, max } = geometry.boundingBox;
+    const width = Math.max(max.x - min.x, max.y - min.y, max.z - min.z, 1e-9) / (CELLS - 1);
+    const cornerOf = new Map();
+    const corner = new Uint32Array(attributes.position.count);
+    for (let row = 0; row < corner.length; row++) {
+      const x = Math.floor((attributes.position.getX(row) - min.x) / width);
+      const y = Math.floor((attributes.position.getY(row) - min.y) / width);
+      const z = Math.floor((attributes.position.getZ(row) - min.z) / width);
+      const cell = (x * CELLS + y) * CELLS + z;
+      if (!cornerOf.has(cell)) cornerOf.set(cell, row);
+      corner[row] = cornerOf.get(cell);
+    }
+    const kept = [];
+    for (let face = 0; face < index.count; face += 3) {
+      const [a, b, c] = [0, 1, 2].map((k) => corner[index.array[face + k]]);
+      if (a !== b && b !== c && c !== a) kept.push(a, b, c);
+    }
+    return new index.constructor(new Uint32Array(kept), 1);
+  };
+  const setMeshes = (isCoarse) => {
+    window.__viserMutable.scene.traverse(({ isMesh, isInstancedMesh, geometry }) => {
+      if (!isMesh || isInstancedMesh || !geometry.index) return;
+      const states = geometry.userData;
+      if (!states.fine && (!isCoarse || geometry.index.count < 3 * SMALL_MESH)) return;
+      if (!states.fine) Object.assign(states, { fine: geometry.index, coarse: coarseIndex(geometry) });
+      geometry.setIndex(isCoarse ? states.coarse : states.fine);
+    });
   };
   const setGround = (isVisible) => {
     const ground = window.__viserMutable.nodeRefFromName["/ground"];
@@ -149,7 +213,7 @@
     }
     const part = Math.min(1, budget / Math.max(total, 1));
     all.forEach(([cloud, count]) => drawPart(cloud, count, part));
-    const state = store();
+    const state = viewerState();
     if (!state) return;
     if (isReduced) {
       // viser changes the ratio of slow pages
@@ -161,14 +225,16 @@
     state.setDpr(0.5 * pixelRatio);
     setGround(false);
     thinLines();
+    setMeshes(true);
   };
   const restore = () => {
     isReduced = false;
-    clouds().forEach(([cloud, count]) => drawPart(cloud, count, 1));
-    const state = store();
+    drawRest();
+    const state = viewerState();
     if (state) state.setDpr(pixelRatio);
     setGround(true);
     widenLines();
+    setMeshes(false);
     window.__viserMutable.requestRender();
   };
 
@@ -288,6 +354,100 @@
   };
 })();
 
+// Colours of the grid, which viser has from the server, in pages that are dark.
+(() => {
+  const COLOURS = { light: [0xeceef1, 0xdadde2], dark: [0x2a2c30, 0x3a3d42] };
+  let shown = "";
+  setInterval(() => {
+    const ground = window.__viserMutable && window.__viserMutable.nodeRefFromName["/ground"];
+    if (!ground) return;
+    const theme = document.documentElement.dataset.mantineColorScheme || "light";
+    ground.traverse(({ material, id }) => {
+      const uniforms = material && material.uniforms;
+      if (!uniforms || !uniforms.cellColor || shown === theme + id) return;
+      shown = theme + id;
+      const [cell, section] = COLOURS[theme];
+      uniforms.cellColor.value.set(cell);
+      uniforms.sectionColor.value.set(section);
+      window.__viserMutable.requestRender();
+    });
+  }, 100);
+})();
+
+// Swipe line: left of it another state or map, which is in layers whose names begin so, right of it the map.
+(() => {
+  const OTHER = "/map/swiped_";
+  const MAP = /^\/(map|history|play)\//;
+  let share = 0.5; // of the picture's width
+  let line = null;
+  let canvas = null;
+
+  const place = () => {
+    const box = canvas.getBoundingClientRect();
+    line.style.left = `${box.left + share * box.width - 15}px`;
+    line.setAttribute("aria-valuenow", Math.round(100 * share));
+  };
+  const moveTo = (wanted) => {
+    share = Math.min(0.98, Math.max(0.02, wanted));
+    place();
+    window.__viserMutable.requestRender();
+  };
+  const show = () => {
+    line = document.createElement("div");
+    line.className = "maplab-swipe";
+    Object.entries({ role: "slider", tabindex: 0, "aria-label": "swipe line" }).forEach((pair) =>
+      line.setAttribute(...pair),
+    );
+    line.addEventListener("pointerdown", (event) => line.setPointerCapture(event.pointerId));
+    line.addEventListener("pointermove", (event) => {
+      const box = canvas.getBoundingClientRect();
+      if (event.buttons) moveTo((event.clientX - box.left) / box.width);
+    });
+    line.addEventListener("keydown", (event) => {
+      const step = { ArrowLeft: -0.02, ArrowRight: 0.02 }[event.key];
+      if (step) moveTo(share + step);
+      if (step) event.stopPropagation();
+    });
+    document.body.append(line);
+    place();
+    window.addEventListener("resize", place);
+  };
+  const hide = () => {
+    window.removeEventListener("resize", place);
+    line.remove();
+    line = null;
+  };
+
+  // draws the picture in two halves, each without the nodes of the other
+  drawBy((gl, draw) => {
+    canvas = gl.domElement;
+    if (!line || gl.getRenderTarget() !== null) {
+      draw();
+      return;
+    }
+    const nodes = window.__viserMutable.nodeRefFromName;
+    const size = gl.getSize({ set: (width, height) => [width, height] });
+    const without = (isHidden, x, width) => {
+      const hidden = Object.keys(nodes).filter((name) => nodes[name] && nodes[name].visible && isHidden(name));
+      hidden.forEach((name) => (nodes[name].visible = false));
+      gl.setScissor(x, 0, width, size[1]);
+      draw();
+      hidden.forEach((name) => (nodes[name].visible = true));
+    };
+    const cut = Math.round(share * size[0]);
+    gl.setScissorTest(true);
+    without((name) => MAP.test(name) && !name.startsWith(OTHER), 0, cut);
+    without((name) => name.startsWith(OTHER), cut, size[0] - cut);
+    gl.setScissorTest(false);
+  });
+  setInterval(() => {
+    if (!canvas) return;
+    const nodes = window.__viserMutable.nodeRefFromName;
+    const isWanted = Object.keys(nodes).some((name) => name.startsWith(OTHER) && nodes[name]);
+    if (isWanted !== Boolean(line)) (isWanted ? show : hide)();
+  }, 200);
+})();
+
 // Lets the server read and write the page's address: of the messages of one page that viser has, those
 // of local storage do both. Behind the # is a view that was shared (links.py).
 (() => {
@@ -296,13 +456,18 @@
   let link = location.hash.slice(1); // told once: a page that connects again keeps its view
   // viser would take what is behind the # for a part of the server's address
   if (link && location.protocol !== "file:") history.replaceState(null, "", location.href.split("#")[0]);
+  // the theme is one of the page, not of all of its origin, and at first the system's
+  const THEME = /maplab_theme$/;
+  const systemTheme = () => (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "");
   Storage.prototype.getItem = function (key) {
+    if (THEME.test(key)) return getItem.call(sessionStorage, key) || systemTheme();
     if (!KEY.test(key)) return getItem.call(this, key);
     const told = link;
     link = "";
     return told;
   };
   Storage.prototype.setItem = function (key, value) {
+    if (THEME.test(key)) return setItem.call(sessionStorage, key, value);
     if (!KEY.test(key)) return setItem.call(this, key, value);
     history.replaceState(null, "", `#${value}`);
     if (navigator.clipboard) navigator.clipboard.writeText(location.href).catch(() => {});

@@ -51,9 +51,6 @@ class Actions(Protocol):
     def set_point_scale(self, factor: float) -> None:
         """Draw points larger or smaller."""
 
-    def set_dark(self, is_dark: bool) -> None:
-        """Change the theme."""
-
     def set_ground(self, is_visible: bool) -> None:
         """Show or hide the grid."""
 
@@ -169,7 +166,6 @@ class Panel:
         self.view = self._gui.add_folder("View", order=5, expand_by_default=False)
         with self.view:
             self.views = self._gui.add_button_group("look", VIEWS)
-            self.dark: Any = self._gui.add_checkbox("dark", False)
             self.ground = self._gui.add_checkbox("ground grid", True)
             self.point_scale = self._gui.add_slider("point size", 0.2, 5.0, 0.1, 1.0)
         self.views.on_click(
@@ -179,7 +175,6 @@ class Panel:
                 self.say,
             )
         )
-        self._bind(self.dark, lambda event: self._actions.set_dark(event.target.value))
         self._bind(self.ground, lambda event: self._actions.set_ground(event.target.value))
         self._bind(
             self.point_scale, lambda event: self._actions.set_point_scale(event.target.value)

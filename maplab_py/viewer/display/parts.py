@@ -118,13 +118,11 @@ class Nodes:
         for key in list(self._nodes):
             self._remove(key)
 
-    def show_ground(self, ground: Ground, *, is_dark: bool) -> None:
+    def show_ground(self, ground: Ground) -> None:
         """Draw a grid at the floor of the map, its axes with coordinates, and the scale bar."""
         for handle in self._ground:
             handle.remove()
-        grey, strong = (
-            ((42, 44, 48), (58, 61, 66)) if is_dark else ((236, 238, 241), (218, 221, 226))
-        )
+        grey, strong = (236, 238, 241), (218, 221, 226)  # page.js has those of dark pages
         scene = self._server.scene
         grid = scene.add_grid(
             "/ground",
@@ -303,11 +301,19 @@ def coloured_glb(mesh: Mesh) -> bytes:
         {"bufferView": 2, "componentType": _UINT32, "count": faces.size, "type": "SCALAR"},
     ]  # fmt: skip
     primitive = {"attributes": {"POSITION": 0, "COLOR_0": 1}, "indices": 2, "material": 0}
-    matt = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    is_clear = mesh.opacity < 1.0
+    matt = {
+        "metallicFactor": 0.0, "roughnessFactor": 1.0, "baseColorFactor": [1, 1, 1, mesh.opacity],
+    }  # fmt: skip
     content = {
         "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0}], "meshes": [{"primitives": [primitive]}],
-        "materials": [{"pbrMetallicRoughness": matt, "doubleSided": True}],
+        "materials": [
+            {
+                "pbrMetallicRoughness": matt, "doubleSided": True,
+                "alphaMode": "BLEND" if is_clear else "OPAQUE",
+            }
+        ],
         "buffers": [{"byteLength": starts[-1]}], "bufferViews": views, "accessors": accessors,
     }  # fmt: skip
     return _container(json.dumps(content).encode(), b"".join(blocks))

@@ -67,9 +67,22 @@ def take_picture(
         UserError: No page is open and no Chromium is installed.
         EstimationError: The browser gave no picture.
     """
+    with open_client(server, url, size_px) as client:
+        return render(client, size_px, is_dark=is_dark, pose=point_camera(client, extent, view))
+
+
+@contextmanager
+def open_client(server: Any, url: str, size_px: tuple[int, int]) -> Iterator[Any]:
+    """Give the newest open page; without one, a page of a Chromium that runs for as long as this lasts.
+
+    Raises:
+        UserError: No page is open and no Chromium is installed.
+        EstimationError: The browser did not show the page.
+    """
     clients = sorted(server.get_clients().items())
     if clients:
-        return _render(clients[-1][1], extent, view, size_px, is_dark=is_dark)
+        yield clients[-1][1]
+        return
     browser = find_browser()
     if browser is None:
         raise UserError(
@@ -77,8 +90,7 @@ def take_picture(
             "(apt-get install chromium)"
         )
     with headless_browser(browser, url, size_px):
-        client = _first_client(server)
-        return _render(client, extent, view or "overview", size_px, is_dark=is_dark)
+        yield _first_client(server)
 
 
 def _first_client(server: Any) -> Any:
@@ -93,17 +105,28 @@ def _first_client(server: Any) -> Any:
     raise EstimationError(f"the browser did not show the page within {_CONNECT_S:.0f} s")
 
 
-def _render(
-    client: Any, extent: Extent, view: str, size_px: tuple[int, int], *, is_dark: bool
-) -> U8:
+def point_camera(client: Any, extent: Extent, view: str) -> dict[str, Any]:
+    """Let a page look at an extent, "" = where it looks already, and return the pose of its camera."""
+    camera = client.camera
     if view:
         with client.atomic():
-            aim(client.camera, extent, view, beside_panel=False)
+            aim(camera, extent, view, beside_panel=False)
         time.sleep(_SETTLE_S)
+    return {
+        "wxyz": np.array(camera.wxyz), "position": np.array(camera.position), "fov": float(camera.fov)
+    }  # fmt: skip
+
+
+def render(client: Any, size_px: tuple[int, int], *, is_dark: bool, pose: dict[str, Any]) -> U8:
+    """Return a picture (H, W, 3) RGB that a page takes from a pose.
+
+    Raises:
+        EstimationError: The browser gave no picture.
+    """
     width, height = size_px
     try:
         picture = client.get_render(
-            height=height, width=width, transport_format="png", timeout=_RENDER_S
+            height=height, width=width, transport_format="png", timeout=_RENDER_S, **pose
         )
     except (TimeoutError, RuntimeError, ConnectionError) as error:
         raise EstimationError(f"the browser gave no picture: {error}") from None

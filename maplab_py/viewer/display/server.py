@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import functools
 import gzip
+import http
 import logging
 import re
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import resources
 from typing import Any
@@ -22,6 +24,8 @@ from maplab_py.errors import UserError
 LOOPBACK = "127.0.0.1"
 _LOCAL_ORIGINS = (None, re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d+)?"))
 """Origins that may open a connection: pages of this viewer on any forwarded port, and programs."""
+
+_GO = re.compile(r"/go/([0-9a-f]{1,32})")
 
 logger = logging.getLogger(__name__)
 _rich_print = rich.print
@@ -44,11 +48,12 @@ class _Forwarder(logging.Handler):
         logger.info("%s: %s", record.name, record.getMessage(), exc_info=record.exc_info)
 
 
-def start_server(port: int) -> viser.ViserServer:
+def start_server(port: int, go: Callable[[str], str]) -> viser.ViserServer:
     """Start a server on the loopback interface.
 
     Args:
         port: Wanted port; a busy one is replaced by the next that is free, 0 = any.
+        go: Shows what an id means, the last part of an address /go/ID, and returns a page that says so.
 
     Raises:
         UserError: The port is not one, or none is free.
@@ -58,7 +63,7 @@ def start_server(port: int) -> viser.ViserServer:
     _hush_libraries()
     with (
         _patching,
-        _patch(websockets.asyncio.server, "serve", _restricted_serve()),
+        _patch(websockets.asyncio.server, "serve", _restricted_serve(go)),
     ):
         try:
             server = viser.ViserServer(host=LOOPBACK, port=port, verbose=False, label="maplab")
@@ -69,7 +74,7 @@ def start_server(port: int) -> viser.ViserServer:
     return server
 
 
-def _restricted_serve() -> Any:
+def _restricted_serve(go: Callable[[str], str]) -> Any:
     """Return the function that opens the socket, restricted to connections of the viewer's pages.
 
     The page that it serves carries the script `page.js` and the style `page.css`.
@@ -78,7 +83,7 @@ def _restricted_serve() -> Any:
 
     def restricted(*arguments: Any, process_request: Any = None, **settings: Any) -> Any:
         if process_request is not None:
-            process_request = with_page_script(process_request)
+            process_request = with_links_to_ids(with_page_script(process_request), go)
         return serve(
             *arguments, origins=_LOCAL_ORIGINS, process_request=process_request, **settings
         )
@@ -120,6 +125,27 @@ def with_page_script(process_request: Any) -> Any:
         del response.headers["Content-Length"]
         response.headers["Content-Length"] = str(len(response.body))
         return response
+
+    return process
+
+
+def with_links_to_ids(process_request: Any, go: Callable[[str], str]) -> Any:
+    """Return a server of files that also answers /go/ID, but not to pages of other sites."""
+
+    async def answer(connection: Any, id_: str) -> Any:
+        page = await asyncio.get_running_loop().run_in_executor(None, go, id_)
+        response = connection.respond(http.HTTPStatus.OK, page)
+        del response.headers["Content-Type"]
+        response.headers["Content-Type"] = "text/html; charset=utf-8"
+        return response
+
+    def process(connection: Any, request: Any) -> Any:
+        match = _GO.fullmatch(request.path)
+        if match is None:
+            return process_request(connection, request)
+        if request.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
+            return connection.respond(http.HTTPStatus.FORBIDDEN, "")
+        return answer(connection, match[1])
 
     return process
 

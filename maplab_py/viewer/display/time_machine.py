@@ -37,12 +37,22 @@ class TimeMachine:
             self.slider: Any = server.gui.add_slider(
                 "state", 0, 1, 1, 1, hint="the map before and after each command"
             )
+            self.swipe: Any = server.gui.add_checkbox(
+                "swipe line", False, hint="the state left of a line, the map right of it"
+            )
             self.chart = server.gui.add_html("")
-        self.slider.on_update(by_user(lock, lambda event: show_state(int(event.target.value)), say))
+        show = by_user(lock, lambda _: show_state(int(self.slider.value)), say)
+        self.swipe.on_update(show)
+        self.slider.on_update(show)
         self._is_stopped = False
         self._subject: Subject | None = None
         self._curves: tuple[Curve, ...] = ()
         self._measured: Subject | None = None  # that the curves belong to
+
+    @property
+    def swipes(self) -> bool:
+        """Tell whether states are shown left of a swipe line."""
+        return bool(self.swipe.value)
 
     def show(self, subject: Subject) -> None:
         """Show the history of a subject, with the curves that are known of it."""
@@ -52,6 +62,9 @@ class TimeMachine:
             self._folder.visible = len(states) > 1
         if len(states) < 2:
             return
+        is_swiped = subject.other is not None and subject.arrangement == "swipe"
+        if self.swipe.value != is_swiped:
+            self.swipe.value = is_swiped
         if int(self.slider.max) != len(states) - 1:
             self.slider.max = len(states) - 1
         if int(self.slider.value) != subject.place:

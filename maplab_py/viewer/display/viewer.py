@@ -33,6 +33,7 @@ from maplab_py.viewer.display.playback_control import Playback
 from maplab_py.viewer.display.player import Player
 from maplab_py.viewer.display.selection import Selection
 from maplab_py.viewer.display.server import LOOPBACK, start_server
+from maplab_py.viewer.display.themes import Themes
 from maplab_py.viewer.display.time_machine import TimeMachine
 from maplab_py.viewer.drawing import Drawing
 from maplab_py.viewer.ground import make_ground
@@ -65,13 +66,13 @@ class Viewer:
 
         Args:
             port: Wanted port; a busy one is replaced by the next, 0 = any.
-            is_dark: Theme at first.
+            is_dark: Let pages be dark, whatever theme their systems have.
 
         Raises:
             UserError: No port is free.
         """
         self._lock = threading.RLock()
-        self._server = start_server(port)
+        self._server = start_server(port, self._go)
         self._cameras = Cameras(self._server)
         self._nodes = Nodes(self._server)
         self._panel = Panel(self._server, self, self._lock)
@@ -83,7 +84,9 @@ class Viewer:
         self._time_machine = TimeMachine(self._server, self.set_state, self._lock, self._panel.say)
         self.court = Court(self._server, self, self._lock, self._panel.say)
         self.links = Links(self._server, self, self._lock, self._panel.view, self._panel.say)
-        self._is_dark = is_dark
+        self._themes = Themes(
+            self._server, self._panel.view, self._lock, self._panel.say, is_dark=is_dark
+        )
         self._drawing: Drawing | None = None
         self.scene: Scene | None = None
         self.subject: Subject | None = None
@@ -94,7 +97,6 @@ class Viewer:
         self._idle.set()
         self._is_stopped = False
         self._next_live = 0.0
-        self.set_dark(is_dark)
         self._server.scene.on_click()(by_user(self._lock, self._click, self._panel.say))
         self._worker = threading.Thread(target=self._work, name="maplab viewer", daemon=True)
         self._worker.start()
@@ -119,8 +121,9 @@ class Viewer:
 
     @property
     def is_dark(self) -> bool:
-        """Tell which theme is shown."""
-        return self._is_dark
+        """Tell the theme of the newest page."""
+        pages = sorted(self._server.get_clients().items())
+        return self._themes.is_dark(pages[-1][1] if pages else None)
 
     @property
     def wanted(self) -> Subject | None:
@@ -207,8 +210,9 @@ class Viewer:
         scene = self._shown()
         self.wait()
         pages = self.pages
+        view = view or ("" if pages else "overview")
         picture = take_picture(
-            self._server, self.url, scene.extent, view, size_px, is_dark=self._is_dark
+            self._server, self.url, scene.extent, view, size_px, is_dark=self.is_dark
         )
         save_picture(picture, path)
         return pages
@@ -226,7 +230,7 @@ class Viewer:
             try:
                 with states_to_choose(self._server, self.drawing, self.subject) as chooser:
                     return export_html(
-                        self._server, scene, layers, path, chooser, is_dark=self._is_dark
+                        self._server, scene, layers, path, chooser, is_dark=self.is_dark
                     )
             finally:
                 self._cameras.aim_new_pages(scene.extent)
@@ -329,7 +333,7 @@ class Viewer:
         with self._lock:
             subject = self.wanted
             if subject is not None and 0 <= place < len(subject.history):
-                self.follow(subject.replace(state=place))
+                self.follow(subject.at_state(place, swipes=self._time_machine.swipes))
 
     def set_point_scale(self, factor: float) -> None:
         """Draw points larger or smaller."""
@@ -337,26 +341,14 @@ class Viewer:
             self._nodes.scale_points(factor)
 
     def set_dark(self, is_dark: bool) -> None:
-        """Change the theme."""
+        """Change the theme of all pages."""
         with self._lock:
-            self._is_dark = is_dark
-            self._server.gui.configure_theme(
-                dark_mode=is_dark, show_share_button=False, show_logo=False,
-                control_width="medium",
-                brand_color=(76, 141, 214),
-            )  # fmt: skip
-            if self._panel.dark.value != is_dark:
-                self._panel.dark.value = is_dark
-            if self.scene is not None:
-                self._show_ground(self.scene)
+            self._themes.set_all(is_dark=is_dark)
 
     def set_ground(self, is_visible: bool) -> None:
         """Show or hide the grid."""
         with self._lock:
             self._nodes.set_ground_visible(is_visible)
-
-    def _show_ground(self, scene: Scene) -> None:
-        self._nodes.show_ground(make_ground(scene.extent, scene.origin_G), is_dark=self._is_dark)
 
     def look(self, client: Any, view: str) -> None:
         """Move the camera of one page."""
@@ -421,6 +413,9 @@ class Viewer:
             pages = list(self._server.get_clients().values()) if clients is None else clients
             self._selection.jump(self.drawing, text, pages)
 
+    def _go(self, id_: str) -> str:
+        return self.links.go(id_)
+
     def _click(self, event: Any) -> None:
         if self.scene is None:
             return
@@ -476,7 +471,7 @@ class Viewer:
             self._selection.clear()
         self._playback.stop()
         if is_new_place:
-            self._show_ground(scene)
+            self._nodes.show_ground(make_ground(scene.extent, scene.origin_G))
         if is_other_map:
             self._cameras.show_all(scene.extent)
         else:

@@ -18,12 +18,42 @@ from maplab_py.viewer.drawing import (
     omission_notes,
     spread_rows,
 )
-from maplab_py.viewer.layers.landmarks import point_size
-from maplab_py.viewer.scene import WHOLE_MAP, Layer, Part
+from maplab_py.viewer.layers.landmarks import landmarks, point_size
+from maplab_py.viewer.layers.paths import trajectories
+from maplab_py.viewer.scene import WHOLE_MAP, Layer, Part, Points, Segments
 from maplab_py.vimap import LandmarkQuality, VIMap, to_hex_list
 
 _GAP = 0.15
 """Between both, as a part of the room that they take across."""
+
+
+def swiped(drawing: Drawing, other: VIMap) -> list[Layer]:
+    """Return paths and landmarks of another map where they are; `page.js` shows them left of a line alone."""
+    state = drawing.of_state(other)
+    return [
+        Layer(
+            f"swiped_{layer.name}", f"{layer.title}, left", _joined(layer), layer.total,
+            legend=layer.legend, notes=layer.notes,
+        )
+        for layer in (trajectories(state), landmarks(state)[0])
+    ]  # fmt: skip
+
+
+def _joined(layer: Layer) -> dict[str, Part]:
+    """Return the parts of all missions, which the map need not have, as one."""
+    clouds = [part for part in layer.parts.values() if isinstance(part, Points)]
+    lines = [part for part in layer.parts.values() if isinstance(part, Segments)]
+    colour, rows = ([getattr(p, name) for p in clouds + lines] for name in ("colours", "rows"))
+    if clouds:
+        p = np.concatenate([part.p for part in clouds])
+        return {
+            WHOLE_MAP: Points(p, np.concatenate(colour), np.concatenate(rows), clouds[0].size_m)
+        }
+    if lines:
+        ends = np.concatenate([part.ends for part in lines])
+        width = lines[0].width_px
+        return {WHOLE_MAP: Segments(ends, np.concatenate(colour), np.concatenate(rows), width)}
+    return {}
 
 
 def beside(drawing: Drawing, other: VIMap, names: tuple[str, str]) -> list[Layer]:

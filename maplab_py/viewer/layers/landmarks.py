@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
-
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.array_types import F64, I64, U8, Mask
+from maplab_py.array_types import F64, I64, U8
 from maplab_py.viewer import colours
 from maplab_py.viewer.drawing import (
     MAX_POINTS,
     NO_POSITION,
     Drawing,
+    MapImages,
     first_camera,
     first_observer,
     make_points,
@@ -189,20 +188,11 @@ _VISIBLE = 40, 215
 """Range of pixels that can be seen on a light and on a dark ground."""
 
 
-@runtime_checkable
-class _PixelSource(Protocol):
-    """Images of a map that know the colours of landmarks."""
-
-    def pixels(self) -> tuple[U8, Mask]:
-        """Return the colours (L, 3) of landmarks, and which of them are known (L,)."""
-        ...
-
-
 def _pixel_colours(drawing: Drawing) -> tuple[U8, tuple[LegendEntry, ...]]:
     """Colour by the pixels of the images that the map keeps; the others stay in the neutral grey."""
     code = colours.to_hex(colours.REFERENCE)
     every = np.tile(colours.REFERENCE, (len(drawing.vi_map.landmarks), 1))
-    if not isinstance(drawing.images, _PixelSource):
+    if not isinstance(drawing.images, MapImages):
         return every, (LegendEntry("the map keeps no images", (code,)),)
     colour, is_known = drawing.images.pixels()
     every[is_known] = np.clip(colour[is_known], *_VISIBLE)

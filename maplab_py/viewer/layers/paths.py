@@ -26,7 +26,9 @@ _MAX_LABELLED_MISSIONS = 8
 
 
 def trajectories(drawing: Drawing) -> Layer:
-    """Lines through the vertices of each mission."""
+    """Lines through the vertices of each mission, in its colour or by time."""
+    if drawing.options.color_paths_by_time:
+        return _paths_by_time(drawing)
     mission = drawing.vi_map.vertices.mission
     start = np.flatnonzero(mission[1:] == mission[:-1])
     p = drawing.p_vertices
@@ -36,6 +38,25 @@ def trajectories(drawing: Drawing) -> Layer:
         colour = drawing.mission_colours[mission[rows[0]]]
         parts[mission_id] = make_segments(p[rows], p[rows + 1], colour, rows, 3.0)
     return Layer("trajectories", "Trajectories", parts, len(drawing.vi_map.missions))
+
+
+def _paths_by_time(drawing: Drawing) -> Layer:
+    vi_map, p = drawing.vi_map, drawing.p_vertices
+    mission = vi_map.vertices.mission
+    start = np.flatnonzero(mission[1:] == mission[:-1])
+    begin_ns = vi_map.vertices.timestamp_ns[vi_map.vertex_start[mission[start]]]
+    seconds = np.asarray(1e-9 * (vi_map.vertices.timestamp_ns[start] - begin_ns), dtype=np.float64)
+    part, low, high = colours.normalised(seconds)
+    colour = colours.ramp(part, colours.SEQUENTIAL)
+    parts: dict[str, Part] = {
+        mission_id: make_segments(
+            p[start[members]], p[start[members] + 1], colour[members], start[members], 3.0
+        )
+        for mission_id, members in drawing.by_mission(mission[start])
+    }
+    codes = tuple(colours.hex_codes(colours.SEQUENTIAL))
+    legend = LegendEntry("time of the path", codes, f"{low:.0f} s", f"{high:.0f} s")
+    return Layer("trajectories", "Trajectories", parts, len(vi_map.missions), legend=(legend,))
 
 
 def vertices(drawing: Drawing) -> Layer:

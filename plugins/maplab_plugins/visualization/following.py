@@ -123,14 +123,18 @@ def _with_history(context: CommandContext, subject: Subject) -> Subject:
 
 
 def _in_colours(subject: Subject) -> Subject:
-    """Return the subject with landmarks in the colours of its images, if nothing else is told apart."""
+    """Return the subject in the colours that say most of a single mission, unless others are asked for.
+
+    Landmarks have those of their pixels, without images those of their height; the path has those of time.
+    """
     from maplab_py.viewer.resource_clouds import VertexImages
 
-    if len(subject.vi_map.missions) != 1 or not isinstance(subject.images, VertexImages):
+    options = subject.options
+    if len(subject.vi_map.missions) != 1 or options.landmark_colouring != "mission":
         return subject
-    if subject.options.landmark_colouring != "mission":
-        return subject
-    return subject.replace(options=subject.options.with_colouring("pixels"))
+    has_images = isinstance(subject.images, VertexImages)
+    options = options.with_colouring("pixels" if has_images else "height")
+    return subject.replace(options=dataclasses.replace(options, color_paths_by_time=True))
 
 
 def verdicts_of_page(context: CommandContext) -> list[list[str]]:

@@ -13,6 +13,7 @@ from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, Report
 from maplab_py.viewer.options import PlaybackOptions, VisualizationOptions
 
 if TYPE_CHECKING:
+    from maplab_py.viewer.building import Arrangement
     from maplab_py.vimap import VIMap
 
 
@@ -154,32 +155,37 @@ def visualize_difference(
     with_map_key: str = "",
     with_snapshot: str = "",
     side_by_side: bool = False,
+    swipe: bool = False,
     options: VisualizationOptions = VisualizationOptions(),
     display: ViewerOptions = ViewerOptions(),
 ) -> DifferenceReport:
-    """Show the selected map over or beside another state of it or another map.
+    """Show the selected map over or beside another state of it or another map, or with a swipe line.
 
-    Over each other lines show how far vertices have moved. Side by side each mission has one colour
-    on both sides, one camera looks at both, and the maps need not have anything in common.
+    Over each other lines show how far vertices have moved. Side by side, and left and right of the line,
+    each mission has one colour, one camera looks at both, and the maps need not have anything in common.
 
     Args:
         with_map_key: Another map in memory; vertices correspond by id.
         with_snapshot: A snapshot of the selected map. With neither the state before the last
             command that changed it.
         side_by_side: Draw the other state or map beside the map instead of over it.
+        swipe: Draw it left of a line that the page moves over both.
     """
     from maplab_py.viewer.building import Subject
     from maplab_py.viewer.layers.references import displacements
 
+    if side_by_side and swipe:
+        raise UserError("give --side_by_side or --swipe, not both")
     other, name = _other_state(context, with_map_key, with_snapshot)
     here, _, distance = displacements(context.vi_map, other)
-    if not len(here) and not side_by_side:
+    if not len(here) and not (side_by_side or swipe):
         raise UserError(
             f"{name} and map '{context.map_key}' have no vertex in common; "
-            "--side_by_side shows both all the same"
+            "--side_by_side and --swipe show both all the same"
         )
+    arrangement: Arrangement = "beside" if side_by_side else "swipe" if swipe else "over"
     subject = Subject(
-        context.vi_map, context.map_key, options, other, name, side_by_side=side_by_side
+        context.vi_map, context.map_key, options, other, name, arrangement=arrangement
     )
     view = show(context, subject, display)
     missing = len(context.vi_map.vertices) + len(other.vertices) - 2 * len(here)

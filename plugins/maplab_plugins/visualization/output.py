@@ -5,11 +5,14 @@ from __future__ import annotations
 import dataclasses
 import time
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from maplab_plugins.visualization.following import NAME, running_viewer, viewer_for_output
 from maplab_py.cancellation import check_cancelled, ending_early
 from maplab_py.plugin import CommandContext, Message, Report, UserError, command
+
+if TYPE_CHECKING:
+    from maplab_py.viewer.display.viewer import Viewer
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,10 +51,11 @@ def save_view(
     """Save what the viewer shows as a picture; without a viewer the selected map.
 
     An open page takes the picture from where it looks; without one a Chromium without a window is
-    started for as long as it takes.
+    started for as long as it takes. A .gif is an animation of the states that undo and redo lead to,
+    with their errors; of more than 40 states 40 that are spread over all of them.
 
     Args:
-        file: A .png or .jpg file.
+        file: A .png, .jpg or .gif file.
         width_px: Width of the picture.
         height_px: Height of the picture.
         view: Where to look from; empty = as the newest open page does.
@@ -62,7 +66,14 @@ def save_view(
         if not 16 <= size <= 8192:
             raise UserError(f"--{name}={size}: must be 16 to 8192")
     with viewer_for_output(context) as viewer:
-        pages = viewer.save_picture(file, (width_px, height_px), view)
+        pages, size_px = viewer.pages, (width_px, height_px)
+        if file.suffix.lower() == ".gif":
+            from maplab_py.viewer.display.animation import save_animation
+
+            saved, states = save_animation(viewer, file, size_px, view)
+            context.terminal.note(f"{saved} of {states} states are in the picture")
+        else:
+            viewer.save_picture(file, size_px, view)
     taken_by = "an open page" if pages else "a browser without a window"
     return SavedPicture(file, f"{width_px} x {height_px}", taken_by)
 
@@ -133,6 +144,13 @@ def viewer_keep(context: CommandContext, *, duration_s: float = 0.0) -> Message:
         duration_s: Time after which it ends by itself; 0 = only at Ctrl-C, or when the viewer stops.
     """
     viewer, start = running_viewer(context), time.monotonic()
+    keep(context, viewer, duration_s)
+    return Message(f"the viewer at {viewer.url} was kept for {time.monotonic() - start:.0f} s")
+
+
+def keep(context: CommandContext, viewer: Viewer, duration_s: float = 0.0) -> None:
+    """Wait until Ctrl-C, until the viewer stops, or for a time [s] that is not zero."""
+    start = time.monotonic()
     context.terminal.note(f"{viewer.url} until Ctrl-C")
     with ending_early() as is_to_end:
         while not (is_to_end() or viewer.is_stopped):
@@ -140,7 +158,6 @@ def viewer_keep(context: CommandContext, *, duration_s: float = 0.0) -> Message:
                 break
             check_cancelled()
             time.sleep(0.1)
-    return Message(f"the viewer at {viewer.url} was kept for {time.monotonic() - start:.0f} s")
 
 
 def _check_target(file: Path, *, overwrite: bool) -> None:

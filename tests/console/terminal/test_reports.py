@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 
 import pytest
 from hypothesis import given
@@ -10,7 +11,7 @@ from hypothesis import strategies as st
 
 from maplab_py.console.terminal.drawing import GAP, drawn, fitted
 from maplab_py.console.terminal.layout import Pairs, Table, blocks_of, format_column
-from maplab_py.console.terminal.render import names_by_id, text_with_names, with_names
+from maplab_py.console.terminal.render import names_by_id, text_with_names, with_links, with_names
 from maplab_py.report import Message, Report, counted
 
 WORDS = st.text("abcdefgh.0123456789", min_size=1, max_size=12)
@@ -396,3 +397,12 @@ def test_numbers_are_printed_as_far_as_their_deviations_say() -> None:
         ["1234", "17", "-9.8"],
     ]
     assert table.rows[3][0] == "1.5000"  # nothing is known about it
+
+
+def test_ids_become_links_to_the_page_of_the_viewer() -> None:
+    text = with_links("a243b811 20261126 of deadbeef, face", "http://127.0.0.1:8080")
+    assert re.sub("\x1b]8;;[^\x1b]*\x1b\\\\", "", text) == "a243b811 20261126 of deadbeef, face"
+    assert re.findall("\x1b]8;;([^\x1b]+)\x1b", text) == [
+        "http://127.0.0.1:8080/go/a243b811",
+        "http://127.0.0.1:8080/go/deadbeef",
+    ]

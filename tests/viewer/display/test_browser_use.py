@@ -162,13 +162,78 @@ def test_the_panel_suits_phones_and_its_words_can_be_read(browser: Any) -> None:
     page.page.close()
 
 
+def test_a_page_has_the_theme_of_its_system_until_another_is_chosen(browser: Any) -> None:
+    viewer = Viewer(0)
+    viewer.show(SUBJECT)
+    light = Page(browser, viewer.url)
+    dark = Page(_OfSystem(browser, "dark"), viewer.url)
+    assert light.wait_until(lambda: dark.picture().mean() < 80)
+    assert light.wait_until(lambda: light.picture().mean() > 200)
+    dark.click(dark.page.get_by_text("View", exact=True))
+    dark.click(dark.page.get_by_text("light or dark", exact=True))
+    assert dark.wait_until(lambda: dark.picture().mean() > 200)
+    dark.page.reload()
+    assert dark.wait_until(lambda: not is_blank(dark.picture()))
+    assert dark.wait_until(lambda: dark.picture().mean() > 200)
+    assert light.errors == dark.errors == []
+    viewer.stop()
+    light.page.close()
+    dark.page.context.close()
+
+
+class _OfSystem:
+    """A browser on a system with a theme."""
+
+    def __init__(self, browser: Any, theme: str) -> None:
+        self._context = browser.new_context(color_scheme=theme)
+
+    def new_page(self, viewport: dict[str, int]) -> Any:
+        page = self._context.new_page()
+        page.set_viewport_size(viewport)
+        return page
+
+
+def test_another_state_is_left_of_the_swipe_line(browser: Any) -> None:
+    viewer = Viewer(0)
+    red, blue = np.array([200, 40, 40]), np.array([40, 40, 200])
+    viewer.show(
+        SUBJECT.replace(other=MAP.replace(), arrangement="swipe", only_layers=("vertices",))
+    )
+    page = Page(browser, viewer.url)
+    line = page.page.locator(".maplab-swipe")
+    assert page.wait_until(lambda: line.count() == 1)
+    viewer.server.scene.add_icosphere("/map/swiped_ball", radius=50.0, color=tuple(red.tolist()))
+    viewer.server.scene.add_icosphere("/map/ball", radius=50.0, color=tuple(blue.tolist()))
+
+    def parts() -> tuple[bool, bool]:
+        picture = page.picture().astype(int)
+        cut = round(line.bounding_box()["x"] + 15)
+        left, right = picture[200:, 5 : cut - 20], picture[200:, cut + 20 : -5]
+        redder = [np.median(side[:, :, 0] - side[:, :, 2]) for side in (left, right)]
+        return redder[0] > 20, redder[1] < -20
+
+    assert page.wait_until(lambda: parts() == (True, True))
+    box = line.bounding_box()
+    page.page.mouse.move(box["x"] + 15, 300)
+    page.page.mouse.down()
+    page.page.mouse.move(250, 300, steps=2)
+    page.page.mouse.up()
+    assert page.wait_until(lambda: abs(line.bounding_box()["x"] + 15 - 250) < 2)
+    assert page.wait_until(lambda: parts() == (True, True))
+    viewer.show(SUBJECT)
+    assert page.wait_until(lambda: line.count() == 0)
+    assert page.errors == []
+    viewer.stop()
+    page.page.close()
+
+
 _OVERFLOWING = """[...document.querySelectorAll(".mantine-ScrollArea-viewport")]
   .filter((area) => area.scrollHeight > area.clientHeight).length"""
 
 
 def test_the_panel_of_many_layers_needs_no_scrolling(browser: Any) -> None:
     viewer = Viewer(0)
-    subject = SUBJECT.replace(other=MAP.replace(), side_by_side=True)
+    subject = SUBJECT.replace(other=MAP.replace(), arrangement="beside")
     scene = viewer.show(subject)
     assert len(scene.layers) == 13
     page = Page(browser, viewer.url, (1280, 720))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import urllib.error
+import urllib.request
 from collections.abc import Iterator
 from typing import Any
 
@@ -155,6 +157,34 @@ def test_a_link_before_the_map_is_told() -> None:
     viewer.stop()
 
 
+def _open(address: str, site: str = "none") -> tuple[int, str]:
+    request = urllib.request.Request(address, headers={"Sec-Fetch-Site": site})
+    try:
+        with urllib.request.urlopen(request, timeout=20.0) as answer:
+            return answer.status, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        return error.code, ""
+
+
+def test_an_address_of_an_id_selects_it(viewer: Viewer) -> None:
+    """Ids that the console prints are links of this kind."""
+    id_ = to_hex(MAP.landmarks.id[3])
+    status, page = _open(f"{viewer.url}/go/{id_}")
+    assert status == 200
+    picked = viewer.selection.picked
+    assert picked is not None
+    assert (picked.entity, picked.row) == (Entity.LANDMARK, 3)
+    # no page is open: this one becomes the viewer's
+    shared = read_link(page.split("/#")[1].split("'")[0])
+    assert shared.picked_id == id_
+    np.testing.assert_allclose(shared.camera_G[1], MAP.p_G[3], atol=1e-3)
+    viewer.clear_pick()
+    assert _open(f"{viewer.url}/go/{id_}", "cross-site")[0] == 403
+    assert viewer.selection.picked is None
+    assert "has an id that starts" in _open(f"{viewer.url}/go/{32 * 'f'}")[1]
+    assert _open(f"{viewer.url}/go/../x")[0] != 403
+
+
 def test_links_stay_short() -> None:
     names = tuple(f"a_layer_of_a_plugin_{k}" for k in range(100))
     with pytest.raises(UserError, match="100 layers are too many for a link: hide some"):
@@ -174,12 +204,8 @@ def test_a_page_is_asked_for_its_address_and_moved(viewer: Viewer) -> None:
     with open_page(viewer) as page:
         read_until(page, is_replayed)
         page.send(msgspec.msgpack.encode(camera))
-        (*_, question) = (
-            message
-            for message in read_until(page, lambda m: m["type"] == _QUESTION)
-            if message["type"] == _QUESTION
-        )
-        assert question["key"] == KEY
+        asked = read_until(page, lambda m: m["type"] == _QUESTION and m["key"] == KEY)
+        question = next(m for m in asked if m["type"] == _QUESTION and m["key"] == KEY)
         answer = {
             "type": "LocalStorageGetItemResponseMessage", "value": link, "error": None,
             "request_uuid": question["request_uuid"],

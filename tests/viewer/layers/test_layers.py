@@ -24,6 +24,7 @@ from maplab_py.viewer.layers import covariances
 from maplab_py.viewer.layers.closures import ACCEPTED, REFUSED
 from maplab_py.viewer.layers.clouds import Cloud
 from maplab_py.viewer.layers.covariances import ABSOLUTE_POSES, LOOP_CLOSURES, ellipsoids
+from maplab_py.viewer.layers.coverage import SeenVolume, _crossings
 from maplab_py.viewer.options import VisualizationOptions
 from maplab_py.viewer.picking import pick
 from maplab_py.viewer.scene import (
@@ -220,7 +221,7 @@ def test_a_mesh_in_one_colour_has_a_swatch() -> None:
 
 def _both(vi_map: VIMap, other: VIMap) -> tuple[Scene, Segments, Points]:
     scene = build_scene(
-        Subject(vi_map, "after", other=other, other_name="snapshot 'before'", side_by_side=True)
+        Subject(vi_map, "after", other=other, other_name="snapshot 'before'", arrangement="beside")
     )
     path = scene.layer("reference_trajectories").parts[""]
     names = scene.layer("names").parts[""]
@@ -378,3 +379,51 @@ def test_of_very_many_only_some_are_drawn(monkeypatch: pytest.MonkeyPatch) -> No
     layer = build_scene(Subject(vi_map, options=options)).layer(LOOP_CLOSURES)
     assert layer.title == "Loop closure covariances (one of 2)"
     assert layer.drawn == 72
+
+
+def test_tubes_widen_from_where_the_path_is_held() -> None:
+    vi_map = walk_map(vertices=30, landmarks=200, seed=2)
+    scene = build_scene(Subject(vi_map, options=VisualizationOptions(coverage=True)))
+    (tube,) = scene.layer("uncertainty").parts.values()
+    assert isinstance(tube, Mesh)
+    rings = tube.p.reshape(len(vi_map.vertices), -1, 3)
+    radius = np.linalg.norm(rings - rings.mean(axis=1, keepdims=True), axis=2).max(axis=1)
+    np.testing.assert_allclose(rings.mean(axis=1), vi_map.T_G_I[:, 4:], atol=1e-3)
+    assert radius[0] < 1e-6 < radius[len(radius) // 4] < radius[-1] < 1.0
+    assert tube.opacity < 1.0
+
+
+def test_volume_that_rays_cross_from_many_sides_has_no_fog() -> None:
+    start = np.array([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0], [0.0, 9.0, 0.0]]) + 0.5
+    end = start[[1, 0, 0]] * [1.0, 1.0, 1.0]
+    seen = _crossings(start, end, np.zeros(3), 1.0, np.array([10, 10, 1]))
+    assert seen[5, 0, 0] == 2  # there and back
+    assert seen[0, 5, 0] == 1
+    assert seen[5, 5, 0] == 0
+    counts = np.zeros((9, 9, 3), dtype=np.uint8)
+    counts[3:6, 3:6, 1], counts[7, 7, 1] = 3, 1
+    fog = SeenVolume(np.zeros(3), 1.0, counts).is_foggy
+    assert not fog[4, 4, 1]
+    assert fog[2, 4, 1]
+    assert fog[4, 4, 2]
+    assert fog[7, 7, 1]
+    assert not fog[0, 0, 0]
+
+
+def test_paths_are_coloured_by_time(two_missions: VIMap) -> None:
+    options = VisualizationOptions(color_paths_by_time=True)
+    layer = build_scene(Subject(two_missions, options=options)).layer("trajectories")
+    for part in layer.parts.values():
+        assert isinstance(part, Segments)
+        np.testing.assert_array_equal(part.colours[0], colours.SEQUENTIAL[0])
+        assert len(np.unique(part.colours, axis=0)) > 4
+    assert layer.legend[0].low == "0 s"
+
+
+def test_a_map_that_nothing_determines_has_no_tube_and_says_so() -> None:
+    whole = walk_map(seed=1)
+    bare = VIMap(missions=whole.missions, baseframes=whole.baseframes, vertices=whole.vertices)
+    options = VisualizationOptions(coverage=True)
+    scene = build_scene(Subject(bare, options=options))
+    assert "uncertainty" not in scene.names
+    assert any(note.startswith("Uncertainty of the path: ") for note in scene.notes)
