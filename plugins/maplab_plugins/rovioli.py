@@ -74,13 +74,12 @@ def rovioli(
 ) -> MappingReport:
     """Make a map from a recording: camera images and IMU samples in, a map with landmarks out.
 
-    The estimator follows keypoints and smooths a window of frames with the IMU samples. It starts by
-    itself, at rest or in motion, and starts again, with a new mission, if the estimate diverges. With
+    The estimator smooths a window of frames with the IMU samples. It starts by itself, at rest or in
+    motion, and starts again, with a new mission, if the estimate diverges. With
     --vio_localization_map_folder it tells where it is in that map. The new map stays in memory and is
     saved to --save_map_folder; with --submap_spool it goes to a map server in parts. Ctrl-C ends the
-    recording: the map so far is finished, kept in memory, and saved likewise. A second Ctrl-C cancels
-    the command. With --datasource_type=ros2, ros1 or foxglove it reads the topics of a running robot, and
-    publishes where it is as /maplab/odometry, /maplab/pose_in_map and /tf.
+    recording: the map so far is finished, kept, and saved; a second one cancels. Of a running robot
+    (ros2, ros1, foxglove) it publishes /maplab/odometry, /maplab/pose_in_map and /tf.
 
     Args:
         datasource_folder: EuRoC or TUM-VI folder, ROS bag, or map folder.
@@ -95,12 +94,9 @@ def rovioli(
     from maplab_py.frontend.mapping import Mapping, load_kernels
 
     _check_output(run.output)
-    folder = run.output.save_map_folder
-    key = _new_key(context, map_key, folder)
-    pictures = None
-    if rovioli_visualize_map or keep_viewer:
-        pictures = _pictures(context, key, map_publish_interval_s)
-    is_live = data.type in TRANSPORTS
+    key = _new_key(context, map_key, folder := run.output.save_map_folder)
+    is_shown, is_live = rovioli_visualize_map or keep_viewer, data.type in TRANSPORTS
+    pictures = _pictures(context, key, map_publish_interval_s) if is_shown else None
     # runs of hours: the map is at the server, and what is there need not stay in memory
     writer = _writer(submaps, forgets=is_live and folder is None)
     beside = _calibration_beside(run, calibration)
@@ -138,9 +134,7 @@ def rovioli(
     is_at_server = writer is not None and _tell_pushed(context, writer, submaps)
     _keep_map(context, key, finished, is_at_server=is_at_server)
     if pictures is not None:
-        pictures.after_run(finished)
-    if pictures is not None and keep_viewer:
-        pictures.keep(context)
+        pictures.after_run(finished, context if keep_viewer else None)
     return finished.report
 
 
@@ -294,25 +288,26 @@ class _Pictures:
                     run = LocalizedRun(localization.p_G, live.p_G_I, live.rays_G)
                 self._viewer.follow(Subject(vi_map, self._title, localized=run))
 
-    def after_run(self, finished: FinishedRun) -> None:
+    def after_run(self, finished: FinishedRun, keep_in: CommandContext | None = None) -> None:
         """Show the finished map, and how to come back to it; wait, for the program may end now.
 
         A localised run stays as it is drawn, in the frame of the map that it is localised in.
+
+        Args:
+            finished: The run.
+            keep_in: Keep the viewer in this context until Ctrl-C.
         """
+        from maplab_plugins.visualization.output import keep
         from maplab_py.viewer.building import Subject
 
         vi_map, folder = finished.vi_map, finished.report.map_folder
-        if vi_map is None or self._localized.T_G_M is not None or self._viewer.is_stopped:
-            return
-        note = "finished; in memory only: save" if folder is None else f"saved: load {folder}"
-        self._viewer.follow(Subject(vi_map, self._title, note=note))
-        self._viewer.wait(_SECONDS_TO_DRAW)
-
-    def keep(self, context: CommandContext) -> None:
-        """Wait until Ctrl-C."""
-        from maplab_plugins.visualization.output import keep
-
-        keep(context, self._viewer)
+        is_stopped = self._viewer.is_stopped
+        if vi_map is not None and self._localized.T_G_M is None and not is_stopped:
+            note = "finished; in memory only: save" if folder is None else f"saved: load {folder}"
+            self._viewer.follow(Subject(vi_map, self._title, note=note))
+            self._viewer.wait(_SECONDS_TO_DRAW)
+        if keep_in is not None and not is_stopped:
+            keep(keep_in, self._viewer)
 
 
 def _pictures(context: CommandContext, title: str, interval_s: float) -> _Pictures:

@@ -1,4 +1,4 @@
-"""How well a map is determined: tubes of uncertainty, fog over poorly seen volume, where to walk next."""
+"""Tubes of uncertainty along the path, fog over poorly seen volume, and places to walk to next."""
 
 from __future__ import annotations
 
