@@ -61,11 +61,22 @@ _ROWS_AT_ONCE = 16_384
 _SPREAD: dict[int, float] = {FeatureType.XFEAT: 4.0 / 3.0}
 """Distance at which descriptors of a type match, relative to SIFT's. Pairs of recorded keyframes: at 0.45
 XFeat verifies a third fewer than at 0.6; from 0.7 on some are wrong."""
-_PROJECTED: dict[int, float] = {FeatureType.XFEAT: 0.75}
-"""The same of squared distances of projected descriptors. Rendered rooms at an eighth of the light: at 1 one
-of 14 images is localised wrongly in a summary map, at 0.75 none of 11."""
 STEPS_PER_UNIT = 254
 """Steps of a signed byte per unit of length: single numbers up to half the length are kept."""
+
+
+class Projected(NamedTuple):
+    """Descriptors as summary maps hold them: projected to few dimensions."""
+
+    dimensions: int = 10
+    spread: float = 1.0  # squared distance of a match, relative to Binary's
+    coarseness: float = 1.0  # of the steps to which they are rounded
+
+
+_PROJECTED: dict[int, Projected] = {FeatureType.XFEAT: Projected(24, 1.25, 8.0)}
+"""Of 25 images in an eighth of the light (rendered rooms) XFeat localises 22 in a full map. In summary maps 5
+with 10 dimensions, 15 with 16, 21 with 24 and 32, and 24 with all 64, which takes four times as long; one is
+wrong from a spread of 1.7 on. Eight times coarser steps are signed bytes, at no loss."""
 
 
 class DescriptorKind(NamedTuple):
@@ -138,6 +149,16 @@ class DescriptorKind(NamedTuple):
             return bit_fraction * 8 * self.size
         return (distance * _SPREAD.get(self.feature_type, 1.0) * STEPS_PER_UNIT) ** 2
 
-    def largest_projected(self, squared_distance: float) -> float:
-        """Return the largest squared distance of a match of projected descriptors, given Binary's."""
-        return squared_distance * _PROJECTED.get(self.feature_type, 1.0)
+    @property
+    def projected(self) -> Projected:
+        """Return how summary maps hold these descriptors."""
+        return _PROJECTED.get(self.feature_type, Projected())
+
+    def largest_projected(self, squared_distance: float, dimensions: int) -> float:
+        """Return the largest squared distance of a match of projected descriptors.
+
+        Args:
+            squared_distance: That of Binary in 10 dimensions.
+            dimensions: Dimensions; the noise grows with them.
+        """
+        return squared_distance * self.projected.spread * dimensions / Projected().dimensions

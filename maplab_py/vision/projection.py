@@ -18,9 +18,9 @@ from maplab_py.compilation import compiled, prange
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.input_files import read_npz
 from maplab_py.output_files import check_writable, write_bytes
-from maplab_py.vision.descriptors import DescriptorKind
+from maplab_py.vision.descriptors import DescriptorKind, Projected
 
-DIMENSIONS = 10
+DIMENSIONS = Projected().dimensions
 MIN_TRACK_LENGTH = 5
 MAX_TRAINING_SAMPLES = 50_000
 _MIN_TRAINING_TRACKS = 50

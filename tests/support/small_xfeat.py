@@ -55,6 +55,37 @@ def random_arrays(seed: int = 0) -> Arrays:
     return {key: np.asarray(value, dtype=np.float32) for key, value in arrays.items()}
 
 
+def random_matcher_arrays(seed: int = 0) -> Arrays:
+    """Return weights of LighterGlue."""
+    rng = np.random.default_rng(seed)
+    shapes: dict[str, tuple[int, int]] = {"input_proj": (96, 64), "posenc.Wr": (48, 2)}
+    for row in range(6):
+        name = f"transformers.{row}"
+        shapes[f"{name}.self_attn.Wqkv"] = 288, 96
+        for part in (
+            "self_attn.out_proj",
+            "cross_attn.to_qk",
+            "cross_attn.to_v",
+            "cross_attn.to_out",
+        ):
+            shapes[f"{name}.{part}"] = 96, 96
+        for part in ("self_attn", "cross_attn"):
+            shapes[f"{name}.{part}.ffn.0"], shapes[f"{name}.{part}.ffn.3"] = (192, 192), (96, 192)
+    shapes["log_assignment.5.final_proj"], shapes["log_assignment.5.matchability"] = (
+        (96, 96),
+        (1, 96),
+    )
+    arrays: dict[str, Any] = {}
+    for key, shape in shapes.items():
+        arrays[f"{key}.weight"] = rng.normal(0.0, shape[1] ** -0.5, shape)
+        arrays[f"{key}.bias"] = rng.normal(0.0, 0.2, shape[0])
+        if key.endswith("ffn.0"):
+            norm = key.replace("ffn.0", "ffn.1")
+            arrays[f"{norm}.weight"] = rng.uniform(0.5, 1.5, shape[0])
+            arrays[f"{norm}.bias"] = rng.normal(0.0, 0.2, shape[0])
+    return {f"matcher.{key}": np.asarray(value, dtype=np.float32) for key, value in arrays.items()}
+
+
 def checkpoint(arrays: Arrays, *, other: Any = None) -> bytes:
     """Return the content of a checkpoint, with one more value where `other` is given."""
     storage = type("FloatStorage", (), {"__module__": "torch"})

@@ -83,7 +83,9 @@ class Localizer:
         self._max_distance = (
             kind.largest(options.max_bit_fraction, options.max_descriptor_distance)
             if database.has_descriptors
-            else kind.largest_projected(options.max_projected_distance)
+            else kind.largest_projected(
+                options.max_projected_distance, len(database.projection.matrix)
+            )
         )
         self._index = InvertedMultiIndex(
             database.descriptors,

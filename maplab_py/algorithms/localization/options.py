@@ -21,8 +21,8 @@ class LocalizationOptions(Options, prefix="localization_"):
     """Largest Euclidean distance of a match whose descriptors are not binary, scaled to unit length, a
     third more for XFeat; full maps only."""
     max_projected_distance: float = option(40.0, gt=0)
-    """Largest squared distance of projected descriptors of a match, a quarter less for XFeat; summary
-    maps."""
+    """Largest squared distance of projected descriptors of a match in 10 dimensions, a quarter more for
+    XFeat; in proportion with more dimensions; summary maps."""
     places: int = option(6, ge=1)
     """Places of the map that are tried for each query."""
     min_shared_landmarks: int = 5

@@ -53,7 +53,7 @@ def map_features(
     missions: I64,
     *,
     projection: DescriptorProjection | None = None,
-    dimensions: int = DIMENSIONS,
+    dimensions: int | None = DIMENSIONS,
     feature_type: int = FeatureType.BINARY,
     sizes: tuple[int, ...] = (),
     memory: ProjectionMemory | None = None,
@@ -69,7 +69,7 @@ def map_features(
         vi_map: The map.
         missions: Mission rows.
         projection: Projection of descriptors.
-        dimensions: Dimensions of a projection that is learned.
+        dimensions: Dimensions of a projection that is learned; None = as many as in summary maps.
         feature_type: Type of the descriptors.
         sizes: Lengths [bytes] that they may have; empty = any.
         memory: Where a projection is kept for the next call.
@@ -95,7 +95,7 @@ def map_features(
     landmark = vi_map.keypoints.landmark[keypoint].astype(np.int64)
     if projection is None or projection.kind != kind:
         memory = memory or ProjectionMemory()
-        projection = memory.learned(raw, landmark, kind, dimensions)
+        projection = memory.learned(raw, landmark, kind, dimensions or kind.projected.dimensions)
     vertex = vi_map.keypoint_vertex[keypoint].astype(np.int64)
     descriptors = DescriptorSet(
         projected=projection.project(raw),

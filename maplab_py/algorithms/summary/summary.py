@@ -52,7 +52,12 @@ def make_summary_map(
     progress.step(0, 3, "project descriptors")
     missions = np.arange(len(judged.missions))
     features, projection = map_features(
-        judged, missions, projection=projection, feature_type=feature_type, sizes=sizes
+        judged,
+        missions,
+        projection=projection,
+        dimensions=None,
+        feature_type=feature_type,
+        sizes=sizes,
     )
     rows = features_of_good_landmarks(judged, features)
     if len(rows) == 0:
@@ -89,16 +94,16 @@ def make_summary_map(
         sensors=judged.sensors,
         descriptor_kind=None if features.kind.is_binary else features.kind,
     )
-    return rounded(summary, options)
+    return rounded(summary, options, features.kind.projected.coarseness)
 
 
-def rounded(summary: SummaryMap, options: SummaryMapOptions) -> SummaryMap:
+def rounded(summary: SummaryMap, options: SummaryMapOptions, coarseness: float = 1.0) -> SummaryMap:
     """Round positions and descriptors as set in the options, so that the file compresses better."""
     return dataclasses.replace(
         summary,
         p_G=_to_multiples(summary.p_G, options.position_step_m),
         p_G_observer=_to_multiples(summary.p_G_observer, options.position_step_m),
-        descriptors=_to_multiples(summary.descriptors, options.descriptor_step),
+        descriptors=_to_multiples(summary.descriptors, coarseness * options.descriptor_step),
     )
 
 

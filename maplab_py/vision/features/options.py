@@ -7,6 +7,8 @@ from maplab_py.options import Options, option
 
 DETECTORS = ("fast", "agast")
 DESCRIPTORS = ("brisk", "xfeat")
+NETWORKS = ("xfeat",)
+"""Descriptors by networks, which are installed and slow."""
 
 
 class FeatureOptions(Options, prefix="feature_tracking_"):

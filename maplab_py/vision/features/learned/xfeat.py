@@ -6,36 +6,19 @@ its authors sample them: the centres of its cells lie half a pixel off towards t
 
 from __future__ import annotations
 
-import os
-import threading
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 
 from maplab_py.array_types import F32, F64, U8
-from maplab_py.errors import UserError
-from maplab_py.input_files import read_bytes
 from maplab_py.vision.features.detection import strongest_places
 from maplab_py.vision.features.extension import ExtractedFeatures
+from maplab_py.vision.features.learned.networks import installed, open_network
 from maplab_py.vision.features.learned.xfeat_graph import CELL_PX, DIMENSIONS, SIZE_STEP_PX
 
-_MAX_BYTES = 1 << 28
-_THREADS = 2
 _APART_PX = 5.0
 _MIN_SHARE = 1e-3
 """Strength of the weakest corner relative to the strongest one, so that less light keeps them."""
 _CUBIC = -0.75
 """Slope of the interpolating cubic, that of PyTorch."""
-_lock = threading.Lock()
-_opened: dict[Path, XFeat] = {}
-
-
-def network_file(name: str) -> Path:
-    """Return the file of an installed network ($XDG_DATA_HOME/maplab/networks/NAME.onnx)."""
-    base = os.environ.get("XDG_DATA_HOME", "")
-    folder = Path(base) if base else Path.home() / ".local" / "share"
-    return folder / "maplab" / "networks" / f"{name}.onnx"
 
 
 def installed_xfeat() -> XFeat:
@@ -44,17 +27,7 @@ def installed_xfeat() -> XFeat:
     Raises:
         UserError: It is not installed or damaged, or onnxruntime is missing.
     """
-    file = network_file("xfeat")
-    with _lock:
-        if file not in _opened:
-            try:
-                network = read_bytes(file, _MAX_BYTES, remedy="run install_features xfeat again")
-            except OSError:
-                raise UserError(
-                    "XFeat is not installed on this computer: run install_features xfeat"
-                ) from None
-            _opened[file] = XFeat(network, str(file))
-        return _opened[file]
+    return installed("XFeat", XFeat)
 
 
 class XFeat:
@@ -91,29 +64,6 @@ class XFeat:
         return _bicubic(
             self.descriptor_map(prepared), _cells((uv_px + 0.5) / scale - 0.5, prepared.shape)
         )
-
-
-def open_network(network: bytes, name: str) -> Any:
-    """Return a session of onnxruntime on two threads.
-
-    Raises:
-        UserError: It cannot open the network, or is not installed.
-    """
-    try:
-        import onnxruntime
-        from onnxruntime.capi import onnxruntime_pybind11_state as errors
-    except ImportError:
-        raise UserError("onnxruntime is not installed: pip install 'maplab-py[learned]'") from None
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads, options.inter_op_num_threads = _THREADS, 1
-    options.log_severity_level = 3
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    refusals = (errors.Fail, errors.InvalidArgument, errors.InvalidGraph, errors.InvalidProtobuf,
-                errors.NotImplemented, errors.RuntimeException)  # fmt: skip
-    try:
-        return onnxruntime.InferenceSession(network, options, providers=["CPUExecutionProvider"])
-    except refusals:
-        raise UserError(f"{name}: is no network: run install_features again") from None
 
 
 def _prepare(image: U8) -> tuple[F32, F64]:

@@ -15,8 +15,10 @@ from maplab_py.errors import UserError
 from maplab_py.vision.features.learned import installation
 from maplab_py.vision.features.learned.checkpoint import read_checkpoint
 from maplab_py.vision.features.learned.installation import install_network
-from maplab_py.vision.features.learned.xfeat import installed_xfeat, network_file
-from tests.support.small_xfeat import checkpoint, random_arrays
+from maplab_py.vision.features.learned.lighterglue import installed_lighterglue
+from maplab_py.vision.features.learned.networks import network_file
+from maplab_py.vision.features.learned.xfeat import installed_xfeat
+from tests.support.small_xfeat import checkpoint, random_arrays, random_matcher_arrays
 
 pytest.importorskip("onnx", reason="the extra [learned] is not installed")
 pytest.importorskip("onnxruntime", reason="the extra [learned] is not installed")
@@ -100,9 +102,19 @@ def test_another_checkpoint_of_the_network_is_installed(tmp_path: Path) -> None:
         installed_xfeat()
     (tmp_path / "mine.pt").write_bytes(checkpoint(random_arrays()))
     report = install_network("xfeat", tmp_path / "mine.pt")
-    assert report.file == network_file("xfeat")
-    assert report.check == "runs; other weights than the published ones"
+    (network,) = report.networks
+    assert (network.network, network.file) == ("XFeat", network_file("xfeat"))
+    assert network.check == "runs; other weights than the published ones"
     assert installed_xfeat().extract(installation.check_image(), 20).descriptors.shape[1] == 64
+
+
+def test_a_checkpoint_of_the_matcher_is_installed(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="LighterGlue is not installed on this computer"):
+        installed_lighterglue()
+    (tmp_path / "mine.pt").write_bytes(checkpoint(random_matcher_arrays()))
+    (network,) = install_network("xfeat", tmp_path / "mine.pt").networks
+    assert (network.network, network.file) == ("LighterGlue", network_file("lighterglue"))
+    assert len(installed_lighterglue().match([installation.check_keypoints()])) == 1
 
 
 def test_files_that_are_not_the_network(tmp_path: Path) -> None:
