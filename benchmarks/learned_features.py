@@ -1,9 +1,9 @@
 """Verified pairs of stereo keyframes by the type of their features: `python -m benchmarks.learned_features`.
 
 Pairs of the recorded keyframes of EuRoC V1_01, 20 s and more apart. Points of one keyframe come from
-its two cameras; keypoints of the left image of the other one are matched with them, mutually best, and
-the pose that most agree on is judged by ground truth. A pair counts as verified where at least as many
-keypoints agree as no wrong pose has in any pair of the run, and never fewer than `lc` wants.
+its two cameras; keypoints of the left image of the other one are matched with them, mutually best or by
+LighterGlue, and the pose that most agree on is judged by ground truth. A pair counts as verified where at
+least as many keypoints agree as no wrong pose has in any pair of the run, and never fewer than `lc` wants.
 """
 
 import argparse
@@ -27,6 +27,7 @@ from maplab_py.vision import absolute_pose, descriptors
 from maplab_py.vision.epipolar_matching import EpipolarRule, ImageRays, match_images
 from maplab_py.vision.features.extension import ExtractedFeatures
 from maplab_py.vision.features.extractors import KINDS, extract
+from maplab_py.vision.features.learned.lighterglue import ImageKeypoints, installed_lighterglue
 from tests.support.data import shared_data_folder
 
 _APART_S, _NEAR_M, _NEAR_DEG = 20.0, 2.0, 45.0
@@ -34,6 +35,7 @@ _RIGHT_M, _RIGHT_DEG = 0.5, 5.0
 """Largest error of a right pose: a wrong place is off by more."""
 _STEREO_GATES = 0.26, 0.6
 """Share of different bits, or distance, of the same point in both images of a pair."""
+_MATCHER = "lighterglue"
 _EVERY = 4
 """Of pairs that see different places, every 4th is tried."""
 
@@ -48,6 +50,7 @@ class Keyframe:
     rad_per_px: F64  # (N,)
     point_I: F64  # (N, 3) zero where there is none
     has_point: Mask  # (N,)
+    row: I64  # (N,) of the features of the left image
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,11 +73,12 @@ class Result:
 def measure(
     features: str, gates: tuple[float, ...], max_features: int, light: float
 ) -> list[Result]:
-    """Measure one type of features with several gates of its descriptors.
+    """Measure one type of features with several gates of its descriptors; lighterglue matches those of xfeat.
 
     With less light than 1 every other keyframe is darker, and its pairs with the others count.
     """
     options = LoopClosureOptions()
+    title, features = features, "xfeat" if features == _MATCHER else features
     recording = reader_choice.open_recording(shared_data_folder() / "euroc_v101_keyframes")
     cameras, T_I_C = recording.device.cameras, recording.device.T_I_C
     sets = [event for event in EventStream(recording) if isinstance(event, protocol.FrameSet)]
@@ -102,7 +106,10 @@ def measure(
     is_near = _are_near(T_G_I, pairs)
     pairs = np.concatenate([pairs[is_near], pairs[~is_near][::_EVERY]])
     is_near = _are_near(T_G_I, pairs)
-    matches = [_match(frames[a], frames[b]) for a, b in pairs.tolist()]
+    if title == _MATCHER:
+        matches = _match_by_network(found, frames, pairs, images[0][0])
+    else:
+        matches = [_match(frames[a], frames[b]) for a, b in pairs.tolist()]
     for gate in gates:
         most = kind.largest(gate, gate)
         chosen = [(i[gap <= most], j[gap <= most]) for i, j, gap in matches]
@@ -112,7 +119,7 @@ def measure(
         accepted = inliers >= options.min_inlier_count
         results.append(
             Result(
-                features=features,
+                features=title,
                 gate=gate,
                 near_pairs=int(is_near.sum()),
                 verified=int(np.count_nonzero(is_near & is_right & (inliers >= threshold))),
@@ -148,7 +155,7 @@ def _keyframe(
         words = KINDS[features].comparable(np.ascontiguousarray(raw))
         ray_I = np.ascontiguousarray(so3.rotate(T[:4], ray_C[is_ray]))
         sides.append(ImageRays(words, ray_I, rad_per_px[is_ray], T[4:]))
-        kept.append(is_ray)
+        kept.append(np.flatnonzero(is_ray))
     left, right = sides
     largest = KINDS[features].largest(*_STEREO_GATES)
     i, j, _ = match_images(left, right, EpipolarRule(2.0, 0.5, largest, 0.95))
@@ -158,7 +165,9 @@ def _keyframe(
     ahead = np.einsum("nd,nd->n", point - left.origin_G, left.ray_G[i]) > 0.0
     points, has_point = np.zeros((len(left.ray_G), 3)), np.zeros(len(left.ray_G), dtype=np.bool_)
     points[i], has_point[i] = point, ok & ahead
-    return Keyframe(left.words, left.ray_G, left.origin_G, left.rad_per_px, points, has_point)
+    return Keyframe(
+        left.words, left.ray_G, left.origin_G, left.rad_per_px, points, has_point, kept[0]
+    )
 
 
 def _pairs(times_ns: I64) -> I64:
@@ -220,6 +229,25 @@ def _match(query: Keyframe, place: Keyframe) -> tuple[I64, I64, I64]:
     return i, j, descriptors.differences(query.words, i, place.words, j).astype(np.int64)
 
 
+def _match_by_network(
+    found: list[list[ExtractedFeatures]], frames: list[Keyframe], pairs: I64, image: U8
+) -> list[tuple[I64, I64, I64]]:
+    """Return the matches of left images by LighterGlue, which may differ by anything."""
+    size_px = image.shape[1], image.shape[0]
+    sides = [
+        ImageKeypoints(
+            left.keypoints_px[frame.row], np.asarray(left.descriptors)[frame.row], size_px
+        )
+        for (left, _), frame in zip(found, frames, strict=True)
+    ]
+    result = []
+    matched = installed_lighterglue().match([(sides[a], sides[b]) for a, b in pairs.tolist()])
+    for (i, j), place in zip(matched, pairs[:, 1].tolist(), strict=True):
+        kept = frames[place].has_point[j]
+        result.append((i[kept], j[kept], np.zeros(np.count_nonzero(kept), dtype=np.int64)))
+    return result
+
+
 def _vectors(words: U64 | I8) -> F32:
     """Return descriptors as vectors whose products order them as their differences do."""
     if words.dtype == np.int8:
@@ -229,7 +257,8 @@ def _vectors(words: U64 | I8) -> F32:
 
 
 _GATES = {
-    "brisk": (0.26,), "orb": (0.26,), "sift": (0.45, 0.6), "xfeat": (0.34, 0.39, 0.45, 0.53)
+    "brisk": (0.26,), "orb": (0.26,), "sift": (0.45, 0.6), "xfeat": (0.34, 0.39, 0.45, 0.53),
+    "lighterglue": (1.0,),
 }  # fmt: skip
 
 

@@ -29,6 +29,7 @@ from maplab_py.array_types import I64, NDArray
 from maplab_py.distinct import distinct
 from maplab_py.geometry import se3
 from maplab_py.progress import SILENT, Progress
+from maplab_py.report import counted
 from maplab_py.vimap import VIMap, ragged_rows, starts_of_counts
 from maplab_py.vision.absolute_pose import PoseProblems, PoseSolutions, solve_poses
 from maplab_py.vision.index import MatchRule
@@ -102,15 +103,7 @@ def detect(
         ),
     )
     progress.step(3, 4, "poses")
-    search = search_poses(
-        vi_map,
-        features,
-        matches,
-        candidates,
-        tolerance_px=options.ransac_pixel_sigma,
-        seed=options.seed,
-        max_iterations=options.num_ransac_iters,
-    )
+    search, notes = _search(vi_map, features, matches, candidates, options, progress)
     closures, contests = _closures(
         vi_map, features, candidates, search, options, trust_base_frames, choice
     )
@@ -125,7 +118,7 @@ def detect(
         database_landmarks=database_landmarks,
         descriptor_matches=len(matches),
         best_votes=int(candidates.votes.max(initial=0)),
-        notes=_notes(options, given, used),
+        notes=(*_notes(options, given, used), *notes),
         contests=contests,
     )
 
@@ -190,6 +183,44 @@ def _closures(
     return closures, tuple(contests)
 
 
+def _search(
+    vi_map: VIMap,
+    features: MapFeatures,
+    matches: Matches,
+    candidates: Candidates,
+    options: LoopClosureOptions,
+    progress: Progress,
+) -> tuple[PoseSearch, tuple[str, ...]]:
+    """Return the poses of candidates, by a second matching of those with few inliers if it is asked for."""
+
+    def poses(some: Matches, of: Candidates) -> PoseSearch:
+        return search_poses(
+            vi_map,
+            features,
+            some,
+            of,
+            tolerance_px=options.ransac_pixel_sigma,
+            seed=options.seed,
+            max_iterations=options.num_ransac_iters,
+        )
+
+    first = poses(matches, candidates)
+    weak = np.flatnonzero(first.solutions.inlier_count < options.min_inlier_count)
+    if options.matcher == "nearest" or not len(weak):
+        return first, ()
+    from maplab_py.algorithms.loop_closure.second_matching import match_again
+
+    second = poses(*match_again(vi_map, features, matches, candidates, weak, progress))
+    count = second.solutions.inlier_count
+    better = count > first.solutions.inlier_count[weak]
+    row = np.arange(len(candidates.query_vertex))
+    row[weak[better]] = len(row) + np.flatnonzero(better)
+    enough = np.count_nonzero(count >= options.min_inlier_count)
+    again = f"LighterGlue matched {counted(len(weak), 'candidate')} again"
+    note = f"{again}: {enough} of them have enough inliers"
+    return _joined([first, second]).take(row), (note,)
+
+
 def _most_seen(vi_map: VIMap, search: PoseSearch, place: I64) -> I64:
     """Return, per candidate, the vertex of the place's mission that observes most inliers."""
     problem = np.repeat(np.arange(len(place)), np.diff(search.start))
@@ -219,6 +250,21 @@ class PoseSearch:
     feature: I64  # (N,) query feature
     landmark: I64  # (N,)
     bits: NDArray[np.int32]  # (N,)
+
+    def take(self, rows: I64) -> PoseSearch:
+        """Return some candidates."""
+        inner = ragged_rows(self.start, rows)
+        columns = {
+            field.name: getattr(self.solutions, field.name)[
+                inner if field.name == "is_inlier" else rows
+            ]
+            for field in dataclasses.fields(PoseSolutions)
+        }
+        start = starts_of_counts(np.diff(self.start)[rows])
+        solutions = PoseSolutions(**columns)
+        return PoseSearch(
+            solutions, start, self.feature[inner], self.landmark[inner], self.bits[inner]
+        )
 
 
 def search_poses(

@@ -7,6 +7,8 @@ from maplab_py.vimap.descriptors import FeatureType, type_of_name
 _BYTES_OF_DESCRIPTORS = {"": (), "brisk": (48, 64), "freak": (64,), "orb": (32,), "akaze": (61,)}
 """Lengths of binary descriptors: of BRISK, C++ maplab's and OpenCV's."""
 
+MATCHERS = ("nearest", "lighterglue")
+
 
 class FeatureTypeOptions(Options, prefix="lc_"):
     """The descriptors by which places are recognised."""
@@ -22,6 +24,7 @@ class FeatureTypeOptions(Options, prefix="lc_"):
 
     def __post_init__(self) -> None:
         """Check the type."""
+        super().__post_init__()
         try:
             type_of_name(self.feature_type)
         except FlagError as error:
@@ -59,6 +62,9 @@ class LoopClosureOptions(FeatureTypeOptions):
     max_descriptor_distance: float = 0.45
     """Largest Euclidean distance of a match whose descriptors are not binary, scaled to unit length; a third
     more for XFeat"""
+    matcher: str = option("nearest", choices=MATCHERS)
+    """Matches with a place: of nearest descriptors, or lighterglue: images of candidates with too few inliers
+    are matched again by a network (XFeat features only; install_features)"""
     fraction_best_scores: float = 0.25
     """Smallest ratio of the votes of a place to those of the query's best place in the mission"""
     min_image_time_seconds: float = 10.0
@@ -120,3 +126,15 @@ class LoopClosureOptions(FeatureTypeOptions):
     """Search places of other missions only"""
     seed: int = 0
     """Seed of all random choices"""
+
+    def __post_init__(self) -> None:
+        """Check that matcher and type fit.
+
+        Raises:
+            FlagError: They do not.
+        """
+        super().__post_init__()
+        if self.matcher == "lighterglue" and self.type_number != FeatureType.XFEAT:
+            raise FlagError(
+                "--lc_matcher=lighterglue: matches XFeat features: give --lc_feature_type=XFeat, too"
+            )
