@@ -12,17 +12,23 @@ from maplab_py.vision.tracking.tracks import CameraTracks, TrackedImages
 
 
 def described_frames(
-    tracked: TrackedImages, images: tuple[U8, ...], stamp_ns: int
+    tracked: TrackedImages, images: tuple[U8, ...], stamp_ns: int, descriptor_type: str = ""
 ) -> tuple[TrackedFrame, ...]:
     """Return the tracks of each camera with the descriptors of their image patches.
 
     Keypoints so near to the border that they have no descriptor are left out.
 
+    Args:
+        tracked: Tracks of all cameras.
+        images: Images of all cameras.
+        stamp_ns: Time of the images.
+        descriptor_type: Name of the descriptors; empty = those that the tracks are to get.
+
     Raises:
         UserError: The descriptors are those of a network that is not installed.
     """
     return tuple(
-        _described(row, tracks, image, stamp_ns, tracked.descriptor_type)
+        _described(row, tracks, image, stamp_ns, descriptor_type or tracked.descriptor_type)
         for row, (tracks, image) in enumerate(zip(tracked.cameras, images, strict=True))
     )
 

@@ -45,15 +45,22 @@ class FrameKeypoints:
         )
 
 
-def frame_keypoints(update: OdometryUpdate, device: RecordedSensors) -> FrameKeypoints:
+def frame_keypoints(
+    update: OdometryUpdate, device: RecordedSensors, descriptor_type: str = ""
+) -> FrameKeypoints:
     """Return the keypoints of a frame with descriptors of the most frequent size.
 
     Images are described here, keypoints of a replay have their descriptors.
+
+    Args:
+        update: The frame.
+        device: Its sensors.
+        descriptor_type: Name of the descriptors of images; empty = those that the tracks are to get.
     """
     if update.tracks is not None:
         frames: Sequence[TrackedFrame | None] = update.tracks.frames
     elif update.images:
-        frames = described_frames(update.tracked, update.images, update.time_ns)
+        frames = described_frames(update.tracked, update.images, update.time_ns, descriptor_type)
     else:
         frames = ()
     given = [frame for frame in frames if frame is not None]

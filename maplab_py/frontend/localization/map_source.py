@@ -42,7 +42,11 @@ class SearchedMap:
 
 
 def open_map(
-    path: Path, *, with_covariances: bool = False, feature_type: int = FeatureType.BINARY
+    path: Path,
+    *,
+    with_covariances: bool = False,
+    feature_type: int = FeatureType.BINARY,
+    is_free: bool = False,
 ) -> SearchedMap:
     """Read a map folder or a summary map.
 
@@ -50,6 +54,7 @@ def open_map(
         path: Folder of a map, or a summary map or its folder.
         with_covariances: The landmarks' covariances are wanted.
         feature_type: Type of the recording's descriptors.
+        is_free: Where the map has none of that type, another one that images can be described by will do.
 
     Raises:
         UserError: There is no map, it cannot be searched, or it has no covariances.
@@ -57,6 +62,10 @@ def open_map(
     """
     if is_map_folder(path):
         vi_map, _ = load_map(path)
+        there = types_of(vi_map.frames)
+        if is_free and feature_type not in there:
+            others = (KINDS[name].feature_type for name in DESCRIPTORS)
+            feature_type = next((each for each in others if each in there), feature_type)
         return of_map(
             vi_map, str(path), with_covariances=with_covariances, feature_type=feature_type
         )
@@ -115,7 +124,7 @@ def _wrong_type(name: str, types: list[int], feature_type: int) -> str:
     remedy = f"choose a map with {wanted} descriptors"
     for word in DESCRIPTORS:
         if KINDS[word].feature_type in types:
-            remedy += f", or give --feature_tracking_descriptor_type={word}"
+            remedy += f", or give --vio_localization_features={word}"
     there = ", ".join(type_name(kind) for kind in types)
     return f"{name}: its descriptors are {there}, those of the recording {wanted}: {remedy}"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import collections
 import dataclasses
 import time
+from concurrent.futures import Future, ThreadPoolExecutor
 from enum import Enum
 
 import numpy as np
@@ -25,6 +26,7 @@ from maplab_py.frontend.localization.track_check import observed_throughout
 from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.geometry import se3
 from maplab_py.interop.recordings.protocol import RecordedSensors
+from maplab_py.vision.features.options import NETWORKS
 
 _EARLY = 0.95
 """A frame may be matched this share of the interval after the one before."""
@@ -63,7 +65,7 @@ class LocalizedFrame:
     time_ns: int
     state: LocalizationState
     pose: MapPose | None
-    answer: Answer | None  # to this frame
+    answer: Answer | None  # to this frame, or to the one before if a network has described it
     stage_ms: dict[str, float]  # elapsed time
 
 
@@ -85,6 +87,15 @@ class _Remembered:
     path_m: float  # length of the path up to it
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Waiting:
+    """A frame whose keypoints are being described."""
+
+    seen: Future[FrameKeypoints]
+    T_M_I: F64  # (7,)
+    pose: MapPose | None  # in the map then
+
+
 class OnlineLocalization:
     """Localises an odometry in a map.
 
@@ -98,8 +109,17 @@ class OnlineLocalization:
         device: RecordedSensors,
         options: OnlineLocalizationOptions,
         window: WindowOptions | None = None,
+        features: str = "",
     ) -> None:
-        """Index the map."""
+        """Index the map.
+
+        Args:
+            searched: The map.
+            device: Sensors of the recording.
+            options: How it is localised.
+            window: Of the odometry.
+            features: Descriptors of images that are matched; empty = those that the tracks are to get.
+        """
         self.counts = LocalizationCounts()
         self.events: list[MapEvent] = []  # of the last frame
         self.notes = calibration_notes(searched, device)
@@ -115,6 +135,9 @@ class OnlineLocalization:
         self._poses: collections.OrderedDict[int, _Remembered] = collections.OrderedDict()
         self._mission = -1
         self._next_ns = -(1 << 62)
+        self.features = features
+        self._thread: ThreadPoolExecutor | None = None
+        self._waiting: _Waiting | None = None
 
     def after_frame(
         self, update: OdometryUpdate, smoother: FixedLagSmoother | None
@@ -129,11 +152,13 @@ class OnlineLocalization:
         began = time.perf_counter()
         pose = self.estimator.pose(smoother)
         self._remember(update.time_ns, update.state.T_M_I[0], pose)
-        answer = None
+        answer = None if self.problem else self._waited_for()
         if not self.problem and update.time_ns >= self._next_ns:
             interval_ns = 1e9 / self.options.max_frequency_hz
             self._next_ns = update.time_ns + int(_EARLY * interval_ns)
-            answer = self._asked(update, pose)
+            self._ask(update, pose)
+            if self.features not in NETWORKS:
+                answer = self._waited_for()
         spent_ms = {"match": 1e3 * (time.perf_counter() - began)}
         if answer is not None:
             began = time.perf_counter()
@@ -193,13 +218,31 @@ class OnlineLocalization:
 
     # -- inside -----------------------------------------------------------------------------------
 
-    def _asked(self, update: OdometryUpdate, pose: MapPose | None) -> Answer | None:
-        """Match a frame; remember why not when the map cannot be searched at all."""
+    def _ask(self, update: OdometryUpdate, pose: MapPose | None) -> None:
+        """Describe the keypoints of a frame, in a thread if a network does.
+
+        Then its answer is waited for at the next frame, always, so that results do not depend on time.
+        """
         assert update.state is not None
         self.counts.queries += 1
+        seen: Future[FrameKeypoints] = Future()
+        if self.features in NETWORKS and update.images:
+            self._thread = self._thread or ThreadPoolExecutor(1, "maplab-features")
+            seen = self._thread.submit(frame_keypoints, update, self._device, self.features)
+        else:
+            try:
+                seen.set_result(frame_keypoints(update, self._device, self.features))
+            except UserError as error:
+                seen.set_exception(error)
+        self._waiting = _Waiting(seen, update.state.T_M_I[0], pose)
+
+    def _waited_for(self) -> Answer | None:
+        """Match the frame that was described last; remember why not when the map cannot be searched."""
+        waiting, self._waiting = self._waiting, None
+        if waiting is None:
+            return None
         try:
-            seen = frame_keypoints(update, self._device)
-            return self._answer(seen, update.state.T_M_I[0], pose)
+            return self._answer(waiting.seen.result(), waiting.T_M_I, waiting.pose)
         except (UserError, EstimationError) as error:
             self.problem = str(error)
             return None
@@ -294,6 +337,7 @@ class OnlineLocalization:
         self.estimator.stop(None)
         self._filter.clear()
         self._poses.clear()
+        self._waiting = None
 
 
 def _finite(covariance: F64) -> F64:

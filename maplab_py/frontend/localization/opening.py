@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from maplab_py.frontend.localization.map_source import open_map
+from maplab_py.frontend.localization.map_source import check_descriptors, open_map
 from maplab_py.frontend.localization.online import OnlineLocalization
 from maplab_py.frontend.localization.options import OnlineLocalizationOptions
 from maplab_py.frontend.odometry_options import OdometryOptions
+from maplab_py.frontend.vertex_keypoints import check_descriptors_exist
 from maplab_py.interop.recordings.protocol import RecordedSensors
 from maplab_py.vision.features.extractors import KINDS
+from maplab_py.vision.features.options import DESCRIPTORS
 
 
 def opened_localization(
@@ -21,9 +23,24 @@ def opened_localization(
     """
     if options.map_folder is None:
         return None
+    tracked = odometry.tracking.descriptor_type
     searched = open_map(
         options.map_folder,
         with_covariances=options.rule.estimates_landmarks,
-        feature_type=KINDS[odometry.tracking.descriptor_type].feature_type,
+        feature_type=KINDS[options.features or tracked].feature_type,
+        is_free=not options.features,
     )
-    return OnlineLocalization(searched, device, options, odometry.window)
+    kind, features = searched.database.projection.kind, options.features or tracked
+    if not options.features:
+        features = next(
+            (
+                name
+                for name in (tracked, *DESCRIPTORS)
+                if KINDS[name].feature_type == kind.feature_type
+            ),
+            tracked,
+        )
+    else:
+        check_descriptors(searched, kind.size, KINDS[features].feature_type)
+    check_descriptors_exist(features)
+    return OnlineLocalization(searched, device, options, odometry.window, features)

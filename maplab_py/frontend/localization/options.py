@@ -9,6 +9,7 @@ import numpy as np
 from maplab_py.algorithms.localization.options import LocalizationOptions
 from maplab_py.estimation.window.options import MapRule
 from maplab_py.options import Options, option
+from maplab_py.vision.features.options import DESCRIPTORS
 
 MODES = ("vil", "swl", "pose", "odo")
 LANDMARK_UNCERTAINTIES = ("none", "map")
@@ -20,6 +21,9 @@ class OnlineLocalizationOptions(Options, prefix="localization_"):
     matching: LocalizationOptions = LocalizationOptions()
     map_folder: Path | None = option(None, flag="vio_localization_map_folder")
     """Map folder, or summary map, in which the recording is localised"""
+    features: str = option("", choices=("", *DESCRIPTORS), flag="vio_localization_features")
+    """Descriptors of the keypoints of images that are matched with the map: brisk, or xfeat (a network,
+    which runs beside the odometry); empty = those that the map has"""
     mode: str = option("vil", choices=MODES)
     """vil = matches and odometry in one estimate; swl = T_G_M over the window's matches, poses fixed; pose =
     T_G_M from poses of single images; odo = T_G_M from the first matches only"""

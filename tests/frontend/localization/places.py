@@ -98,13 +98,16 @@ def run(
     options: OnlineLocalizationOptions,
     map_: SearchedMap | None = None,
     where: Place | None = None,
+    features: str = "",
 ) -> tuple[OnlineLocalization, list[LocalizedFrame], list[OdometryUpdate]]:
-    """Localise the whole query."""
+    """Localise the whole query; with features by a network its updates seem to have images."""
     where = where or place()
     recording = where.recording()
     rule = options.rule if options.mode == "vil" else None
     odometry = Odometry(recording.device, make_starter=where.start, map_rule=rule)
-    localization = OnlineLocalization(map_ or searched(), recording.device, options)
+    localization = OnlineLocalization(
+        map_ or searched(), recording.device, options, features=features
+    )
     frames, all_updates = [], []
     for event in EventStream(recording):
         if isinstance(event, ImuBatch):
@@ -112,7 +115,8 @@ def run(
         else:
             assert isinstance(event, TrackedFrameSet)
             updates = odometry.push_tracks(event)
-        for update in updates:
+        images = (np.zeros((8, 8), dtype=np.uint8),) if features else ()
+        for update in [dataclasses.replace(each, images=images) for each in updates]:
             frames.append(localization.after_frame(update, odometry.smoother))
             all_updates.append(update)
     return localization, frames, all_updates

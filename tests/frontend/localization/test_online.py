@@ -65,6 +65,22 @@ def test_the_index_alone_localises_too() -> None:
     assert np.median(place().errors_m(frames)) < 0.05
 
 
+def test_answers_of_a_network_come_with_the_next_frame() -> None:
+    localization, frames, _ = run(OPTIONS, features="xfeat")
+    _, again, _ = run(OPTIONS, features="xfeat")
+    answered = [row for row, frame in enumerate(frames) if frame.answer is not None]
+    assert len(answered) > 5
+    for row in answered:
+        answer = frames[row].answer
+        assert answer is not None
+        assert answer.time_ns == frames[row - 1].time_ns
+    assert localization.counts.late == 0
+    assert np.median(place().errors_m(frames)) < 0.05
+    for a, b in zip(frames, again, strict=True):
+        assert (a.pose is None) == (b.pose is None)
+        assert a.pose is None or b.pose is None or np.array_equal(a.pose.T_G_I, b.pose.T_G_I)
+
+
 def test_the_same_run_gives_the_same_bytes() -> None:
     first, second = (run(OPTIONS)[1] for _ in range(2))
     for a, b in zip(first, second, strict=True):
