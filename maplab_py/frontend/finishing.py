@@ -316,6 +316,8 @@ def _localization_notes(mapping: Mapping) -> list[str]:
     if localization is None:
         return []
     notes = list(localization.notes)
+    if localization.features not in ("", mapping.options.odometry.tracking.descriptor_type):
+        notes.append(f"images were described by {localization.features} for it, as the map is")
     if localization.problem:
         notes.append(f"localisation has ended: {localization.problem}")
     elif not localization.counts.localized_frames:

@@ -59,7 +59,7 @@ class Distribution:
 class LocalizationReport(Report):
     """Number, accuracy and run time of localised queries."""
 
-    map_kind: str  # full or summary
+    map_kind: str  # full or summary, and the type of its descriptors unless they are binary
     map_landmarks: int
     map_observations: int
     queries: int

@@ -31,6 +31,7 @@ from maplab_py.geometry import se3
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import counted
 from maplab_py.vimap import VIMap, ragged_rows, starts_of_counts
+from maplab_py.vimap.descriptors import type_name, types_of
 from maplab_py.vision.absolute_pose import PoseProblems, PoseSolutions, solve_poses
 from maplab_py.vision.index import MatchRule
 from maplab_py.vision.projection import DescriptorProjection, load_projection
@@ -118,7 +119,7 @@ def detect(
         database_landmarks=database_landmarks,
         descriptor_matches=len(matches),
         best_votes=int(candidates.votes.max(initial=0)),
-        notes=(*_notes(options, given, used), *notes),
+        notes=(*_types(vi_map, features), *_notes(options, given, used), *notes),
         contests=contests,
     )
 
@@ -138,6 +139,18 @@ def _features(
         feature_type=options.type_number,
         sizes=options.sizes,
         memory=scope.projections,
+    )
+
+
+def _types(vi_map: VIMap, features: MapFeatures) -> tuple[str, ...]:
+    """Say which type of features is matched, where a map has several."""
+    types = types_of(vi_map.frames)
+    others = [type_name(other) for other in sorted(types - {features.kind.feature_type})]
+    if not others:
+        return ()
+    matched = type_name(features.kind.feature_type)
+    return (
+        f"matched {matched} features; the map has {', '.join(others)}, too (--lc_feature_type)",
     )
 
 

@@ -54,14 +54,14 @@ def match_again(
     kept = features.in_database[j] & (label[i] != label[j])
     owner, i, j = owner[kept], i[kept], j[kept]
     words = features.descriptors.words
-    found = Matches(i, j, differences(words, i, words, j))
+    extra = Matches(i, j, differences(words, i, words, j))
     before = np.diff(candidates.start)[which]
     old = candidates.match[ragged_rows(candidates.start, which)]
     owner = np.concatenate([np.repeat(np.arange(len(which)), before), owner])
-    match = np.concatenate([old, len(matches) + np.arange(len(found))])
+    match = np.concatenate([old, len(matches) + np.arange(len(extra))])
     return Matches(
         *(
-            np.concatenate([getattr(matches, n), getattr(found, n)])
+            np.concatenate([getattr(matches, n), getattr(extra, n)])
             for n in ("query", "database", "bits")
         )
     ), Candidates(
