@@ -124,7 +124,10 @@ class _Kernel(CPUDispatcher):  # type: ignore[misc]
         types = tuple(normalize_signature(sig)[0])
         if not _is_inside() and types not in self._with_wrapper:
             self.overloads.pop(types, None)
-        return super().compile(sig)
+        if _is_inside():
+            return super().compile(sig)
+        with kernel_cache.compilation():
+            return super().compile(sig)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """Take numbers in the code of the caller for any numbers, so that one function serves all."""
@@ -215,6 +218,7 @@ class _KernelCache(FunctionCache):  # type: ignore[misc]
             if path.exists():
                 parts = pickle.loads(path.read_bytes())
                 return numba.core.compiler.CompileResult._rebuild(target_context, *parts)
+        kernel_cache.is_compiling.set()
         return None
 
     def _save_overload(self, sig: Any, data: Any) -> None:

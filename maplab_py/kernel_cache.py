@@ -8,7 +8,10 @@ import os
 import shutil
 import stat
 import tempfile
-from collections.abc import Callable
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
@@ -20,6 +23,26 @@ PACKAGED = Path(__file__).resolve().parent / "_kernels"
 
 tell_user: Callable[[str], None] = logging.getLogger(__name__).warning
 """Prints a line for the user; the console replaces it."""
+
+is_compiling = threading.Event()
+"""Set while a kernel is compiled."""
+_seconds = [0.0]
+
+
+def seconds() -> float:
+    """Return the time in which this process compiled and loaded kernels so far [s]."""
+    return _seconds[0]
+
+
+@contextmanager
+def compilation() -> Iterator[None]:
+    """Count the time inside as that of compilation."""
+    begin = time.perf_counter()
+    try:
+        yield
+    finally:
+        _seconds[0] += time.perf_counter() - begin
+        is_compiling.clear()
 
 
 def cache_root() -> Path:

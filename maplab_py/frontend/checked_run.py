@@ -50,6 +50,7 @@ def run_checked(
     """
     mapping = make(recording)
     doctor = _Doctor(recording, mapping, progress)
+    progress.step(0.0, 0.0, "check the first seconds")
     notes = check_first_seconds(recording, mapping.options.stream)
     first = doctor.mended() if notes else None
     if first is not None:

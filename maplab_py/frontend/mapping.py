@@ -239,7 +239,13 @@ class Mapping:
         if now_s >= self._next_status_s:
             self._next_status_s = now_s + _STATUS_EVERY_S
             line = f"{self.statistics.status_line(update)}  {self._status()}".rstrip()
-            progress.step(self.statistics.elapsed_s, 0.0, line)
+            progress.step(self.statistics.elapsed_s, self._total_s(), line)
+
+    def _total_s(self) -> float:
+        """Return the time up to which the recording is read; 0 = not known."""
+        recording, chosen_s = self._recording, self.options.stream.end_s
+        known_s = (recording.end_ns - recording.start_ns) * 1e-9 if recording.end_ns else 0.0
+        return min(filter(None, (chosen_s, known_s)), default=0.0)
 
     def _build(self, update: OdometryUpdate, builder: MapBuilder) -> None:
         if update.healthy_until_ns:

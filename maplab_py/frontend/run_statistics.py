@@ -8,6 +8,7 @@ from array import array
 
 import numpy as np
 
+from maplab_py import kernel_cache
 from maplab_py.frontend.odometry_update import OdometryStatus, OdometryUpdate
 from maplab_py.frontend.reports import EstimatorStart, StageTime
 
@@ -46,6 +47,7 @@ class RunStatistics:
     notes: list[str] = dataclasses.field(default_factory=list)
     stage_ms: array[float] = dataclasses.field(default_factory=lambda: array("f"))  # frame by frame
     began_s: float = dataclasses.field(default_factory=time.perf_counter)
+    compilation_s: float = dataclasses.field(default_factory=kernel_cache.seconds)  # before
     waiting_for: str = ""  # why the estimator does not start
     _reason: str = "beginning of the recording"
     _lost_ns: int = 0
@@ -94,17 +96,22 @@ class RunStatistics:
         self.stage_ms[_STAGES.index(stage) - len(_STAGES)] += spent_ms
 
     def status_line(self, update: OdometryUpdate) -> str:
-        """Return time, tracks, landmarks and time per stage in one line."""
+        """Return time, real-time factor, tracks and landmarks in one line, the dispensable last.
+
+        The factor is that of the recent frames, whose medians leave out compilation.
+        """
         tracks = sum(len(camera) for camera in update.tracked.cameras)
-        parts = [f"{self.elapsed_s:.1f} s", f"{tracks} tracks"]
+        parts = [f"{self.elapsed_s:.1f} s"]
+        if self.frames > _RECENT:
+            frame_ms = 1e3 * self.duration_s / (self.frames - 1)
+            spent_ms = max(self.stages(_RECENT)[-1].median_ms, 1e-3)
+            parts.append(f"{frame_ms / spent_ms:.2g} x real time")
         if update.status is OdometryStatus.INITIALISING:
             parts.append(f"not started: {update.note}" if update.note else "not started")
-        elif update.window is not None:
+        parts.append(f"{tracks} tracks")
+        if update.window is not None:
             parts.append(f"{update.window.num_landmarks} landmarks")
-        times = {stage.stage: stage.median_ms for stage in self.stages(_RECENT)}
-        total = times.pop("all stages", 0.0)
-        listed = ", ".join(f"{stage} {spent:.0f}" for stage, spent in times.items())
-        return "  ".join([*parts, f"{total:.0f} ms ({listed})"])
+        return "  ".join(parts)
 
     def stages(self, last: int = 0) -> tuple[StageTime, ...]:
         """Return median and 99th percentile of each stage over the last frames; 0 = over all."""
@@ -121,8 +128,9 @@ class RunStatistics:
         )
 
     def real_time_factor(self) -> float:
-        """Return the duration of the recording per elapsed time."""
-        return self.duration_s / max(time.perf_counter() - self.began_s, 1e-9)
+        """Return the duration of the recording per elapsed time, compilation left out."""
+        compilation_s = kernel_cache.seconds() - self.compilation_s
+        return self.duration_s / max(time.perf_counter() - self.began_s - compilation_s, 1e-9)
 
     def _after_zero(self, time_ns: int) -> float:
         return (time_ns - (self.zero_ns or self.first_ns)) * 1e-9

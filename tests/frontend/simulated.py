@@ -69,6 +69,10 @@ class EditedRecording:
     def start_ns(self) -> int:
         return self.plain.start_ns
 
+    @property
+    def end_ns(self) -> int:
+        return self.plain.end_ns
+
     def items(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Item]:
         for item in self.items_of:
             if isinstance(item, Exception):

@@ -360,7 +360,7 @@ def test_the_status_line_and_health() -> None:
     Mapping(recording, options, make_starter=start).run(progress)
     assert "tracks" in progress.steps[-1]
     assert "landmarks" in progress.steps[-1]
-    assert " ms (" in progress.steps[-1]
+    assert " x real time" in progress.steps[-1]
     assert 5 <= len(progress.lines) <= 10
     assert all("speed" in line and "tilt" in line for line in progress.lines)
     waiting = Interrupting(10)

@@ -50,6 +50,11 @@ class RecalibratedRecording:
         return self.plain.start_ns
 
     @property
+    def end_ns(self) -> int:
+        """Approximate time of the last item."""
+        return self.plain.end_ns
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """Notes of the reader, and where the calibration is from."""
         return (*self.plain.notes, self.note)

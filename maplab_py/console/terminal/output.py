@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, TextIO
 
+from maplab_py import kernel_cache
 from maplab_py.cancellation import current_token
 from maplab_py.console.terminal.drawing import folded, plain_text
 from maplab_py.console.terminal.foreground import in_waiting_thread, interruptible, terminal_lent
@@ -37,8 +38,9 @@ if TYPE_CHECKING:
 
 SECONDS_BEFORE_BAR = 1.0
 SECONDS_BETWEEN_UPDATES = 0.1
-_COLUMNS_OF_BAR = 38
-"""Width of the bar with its times where it is shortest."""
+_COLUMNS_OF_BAR = 26
+"""Width of the bar with its time where it is shortest."""
+_COMPILATION = "compiling kernels, once"
 
 
 class TerminalProgress:
@@ -66,6 +68,8 @@ class TerminalProgress:
         self._prints_lines = stream.isatty() or verbosity > 0
         self._start = time.monotonic()
         self._updated = 0.0
+        self._done: tuple[float, float | None] = 0.0, None
+        self._tells_compilation = False
         self._lock = threading.Lock()
         self._bar: RichProgress | None = None
         self._task: Any = None
@@ -84,14 +88,17 @@ class TerminalProgress:
         is_end = 0.0 < total <= done
         if now - self._updated < SECONDS_BETWEEN_UPDATES and not is_end:
             return
-        self._updated = now
-        self._update(done, total or None, what or self._what)
+        self._updated, self._tells_compilation = now, False
+        self._done, self._what = (done, total or None), what or self._what
+        self._update(*self._done, self._what)
 
     def tick(self) -> None:
-        """Show that a silent command is running; any thread may call this."""
+        """Show that a silent command runs, or waits for a compilation; any thread may call this."""
         is_late = time.monotonic() - self._start > SECONDS_BEFORE_BAR
-        if self._is_live and self._bar is None and is_late:
-            self._update(0, None, self._what)
+        tells = kernel_cache.is_compiling.is_set()
+        if self._is_live and is_late and (self._bar is None or tells != self._tells_compilation):
+            self._tells_compilation = tells
+            self._update(*self._done, _COMPILATION if tells else self._what)
 
     def line(self, text: str) -> None:
         """Print one line of intermediate result."""
@@ -155,21 +162,19 @@ def _make_bar(stream: TextIO) -> RichProgress:
     from rich.table import Column
     from rich.text import Text
 
-    class RemainingColumn(TimeRemainingColumn):
-        """The time that is left; empty until it can be estimated."""
+    class TimeColumn(TimeRemainingColumn):
+        """The time that is left; until it can be estimated, the time that has passed."""
 
         def render(self, task: Task) -> Text:
             if task.total is None or task.time_remaining is None:
-                return Text()
+                return TimeElapsedColumn().render(task).append(" elapsed", "dim")
             return super().render(task).append(" left", "dim")
 
     return Progress(
         TextColumn("{task.description}", markup=False),
         BarColumn(),
         TaskProgressColumn(table_column=Column(no_wrap=True)),
-        RemainingColumn(table_column=Column(no_wrap=True)),
-        TimeElapsedColumn(table_column=Column(no_wrap=True)),
-        TextColumn("elapsed", style="dim"),
+        TimeColumn(table_column=Column(no_wrap=True)),
         console=Console(file=stream),
         transient=True,
         redirect_stdout=False,  # the streams are swapped by the prompt too, in its own order

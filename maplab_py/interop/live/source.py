@@ -152,6 +152,11 @@ class LiveRecording:
         """Time of the first item; a live source begins now, so it has none."""
         return 0
 
+    @property
+    def end_ns(self) -> int:
+        """Time of the last item: not known."""
+        return 0
+
     def parts(self) -> tuple[protocol.PartSpan, ...]:
         """Return no parts: a live source has no end."""
         return ()

@@ -146,6 +146,12 @@ class BagRecording:
         """Time of the first item."""
         return min(stream.first_ns for stream in self._streams)
 
+    @property
+    def end_ns(self) -> int:
+        """Approximate time of the last item; not known if the clock restarts."""
+        first_ns, last_ns = self._arrivals_ns
+        return 0 if self._reading.recording_part else self.start_ns + last_ns - first_ns
+
     def parts(self) -> tuple[PartSpan, ...]:
         """Return the parts into which restarts of the clock divide the recording; reads all stamps."""
         runs = self._runs()

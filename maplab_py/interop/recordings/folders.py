@@ -190,6 +190,11 @@ class FolderRecording:
         return min(int(table.times(self._part)[0]) for table in self._tables)
 
     @property
+    def end_ns(self) -> int:
+        """Time of the last item."""
+        return max(int(table.times(self._part)[-1]) for table in self._tables)
+
+    @property
     def first_sizes_px(self) -> dict[int, tuple[int, int]]:
         """Width and height of the first image of cameras, where it can be read."""
         sizes: dict[int, tuple[int, int]] = {}

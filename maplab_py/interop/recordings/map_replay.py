@@ -75,6 +75,11 @@ class MapRecording:
         starts = [int(times[0]) for times in (self._times_ns, self._sample_times_ns) if len(times)]
         return min(starts)
 
+    @property
+    def end_ns(self) -> int:
+        """Time of the last vertex."""
+        return int(self._times_ns[-1])
+
     def parts(self) -> tuple[protocol.PartSpan, ...]:
         """Return no parts: the clock of a mission runs on."""
         return ()

@@ -164,6 +164,10 @@ class Recording(Protocol):
         """Time of the first item."""
 
     @property
+    def end_ns(self) -> int:
+        """Approximate time of the last item, for the progress of readers; 0 = not known."""
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """Notes for the user: parts of the recording that are not read."""
 

@@ -53,6 +53,10 @@ class FaultyRecording:
     def start_ns(self) -> int:
         return self.plain.start_ns + min(self.imu_shift_ns, 0)
 
+    @property
+    def end_ns(self) -> int:
+        return self.plain.end_ns
+
     def parts(self) -> tuple[protocol.PartSpan, ...]:
         return self.plain.parts()
 
