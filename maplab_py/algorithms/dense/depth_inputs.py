@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -24,11 +25,40 @@ _INPUT_TYPES = (9, 8, 17, 16, 21)
 """Resource types of depth, the preferred first: optimised, raw, clouds."""
 
 
-def grid_settings(options: FusionOptions) -> GridSettings:
-    """Return the settings of a grid that options describe."""
+_VOXELS_IN_DEPTH = 40
+_VOXELS_M = (0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.075, 0.10)
+"""Sides of voxels that are chosen: of steps, so that the noise of the depth does not change them."""
+_LOOKED_AT = 20
+"""Depth maps that tell the depth of a scene."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneDepth:
+    """Depth of a scene, of some of its depth maps."""
+
+    median_m: float
+    share_in_range: float  # of the pixels with depth
+
+    @classmethod
+    def of(cls, depth: DepthViews, resources: I64, options: FusionOptions) -> SceneDepth:
+        """Measure the depth of resources (rows) in the range of the options; 0 where there is none."""
+        some = resources[:: -(-len(resources) // _LOOKED_AT)].tolist()
+        values = np.concatenate([depth.view(row)[0].ravel() for row in some])
+        used = values[(values >= options.min_ray_length_m) & (values <= options.max_ray_length_m)]
+        return cls(
+            float(np.median(used)) if len(used) else 0.0,
+            len(used) / max(np.count_nonzero(values), 1),
+        )
+
+
+def grid_settings(options: FusionOptions, scene: SceneDepth) -> GridSettings:
+    """Return the settings of a grid that options describe, with voxels that suit the depth of a scene."""
+    fitting_m = scene.median_m / _VOXELS_IN_DEPTH
+    chosen_m = max((m for m in _VOXELS_M if m <= fitting_m), default=_VOXELS_M[0])
+    voxel_m = options.voxel_size_m or chosen_m
     return GridSettings(
-        options.voxel_size_m,
-        options.truncation_m,
+        voxel_m,
+        options.truncation_distance_m or 3.0 * voxel_m,
         options.min_ray_length_m,
         options.max_ray_length_m,
         options.weight_depth_power,

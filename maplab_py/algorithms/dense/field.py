@@ -291,7 +291,8 @@ def create_fields(
             )
             continue
         poses = depth.poses(resources, se3.inverse(vi_map.T_G_M[group[0]]))
-        settings = depth_inputs.grid_settings(fusion)
+        scene = depth_inputs.SceneDepth.of(depth, resources, fusion)
+        settings = depth_inputs.grid_settings(fusion, scene)
         grid = depth_inputs.fuse_views(
             depth, resources, poses, settings, progress, with_free_space=True
         )

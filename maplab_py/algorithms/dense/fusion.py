@@ -10,6 +10,7 @@ import numpy as np
 
 from maplab_py.algorithms.dense.depth_inputs import (
     DepthViews,
+    SceneDepth,
     depth_type,
     fuse_views,
     grid_settings,
@@ -38,8 +39,6 @@ from maplab_py.vimap import ResourceOwner, VIMap, as_keys, resources_of, to_hex,
 
 GRID_TYPE = 18
 """Number of the resource type of grids of truncated signed distances."""
-_LOOKED_AT, _COARSE, _FINE = 5, 20.0, 40.0
-"""Depth maps that tell the depth; voxels in it below which they are coarse, and how many fit."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,6 +53,10 @@ class GridReport:
     voxel_size_m: float
     blocks: int
     megabytes: float
+    median_depth_m: float = 0.0  # of the depth maps; 0 = not measured
+    depth_in_range: float = (
+        0.0  # share of their depth between the smallest and largest that is used
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,28 +118,17 @@ def fuse_depth(
             continue
         T_M_G = se3.inverse(vi_map.T_G_M[group[0]])
         poses = depth.poses(resources, T_M_G)
-        grid = fuse_views(depth, resources, poses, grid_settings(options), progress)
+        scene = SceneDepth.of(depth, resources, options)
+        grid = fuse_views(depth, resources, poses, grid_settings(options, scene), progress)
         fused = FusedDepth(vi_map.resources.id[resources], poses)
         new.add(GRID_TYPE, encode_grid(StoredGrid(grid, fused)))
         owners.append(group[0])
-        reports.append(_report(vi_map, group, grid, len(resources), len(resources), 0))
-        notes += _notes_on_voxels(depth, resources, options.voxel_size_m)
+        report = _report(vi_map, group, grid, len(resources), len(resources), 0)
+        depth_facts = {"median_depth_m": scene.median_m, "depth_in_range": scene.share_in_range}
+        reports.append(dataclasses.replace(report, **depth_facts))
     kept = without_resources(vi_map, former)
     result = new.attached(kept, np.arange(len(new)), owners, ResourceOwner.MISSION)
     return result, FusionReport(resource_type(kind).name, tuple(reports), tuple(notes))
-
-
-def _notes_on_voxels(depth: DepthViews, resources: I64, voxel_size_m: float) -> list[str]:
-    """Return a note where voxels are coarse for the depth of the surfaces, as in a near scene."""
-    some = resources[:: max(1, len(resources) // _LOOKED_AT)].tolist()
-    maps = [depth.view(row)[0] for row in some]
-    depth_m = float(np.median(np.concatenate([view[view > 0.0] for view in maps])))
-    if not voxel_size_m > depth_m / _COARSE:
-        return []
-    return [
-        f"surfaces are at {depth_m:.2f} m at the median, for which voxels of {voxel_size_m:g} m are "
-        f"coarse: --dense_tsdf_voxel_size_m={max(0.01, depth_m / _FINE):.2f} --overwrite shows more"
-    ]
 
 
 def update_grids(

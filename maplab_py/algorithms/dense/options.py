@@ -12,8 +12,8 @@ MESH_MIN_WEIGHT = 2.5
 class FusionOptions(Options, prefix="dense_tsdf_"):
     """Grid of truncated signed distances, and the weights of measurements."""
 
-    voxel_size_m: float = option(0.10, gt=0)
-    """Side of a voxel"""
+    voxel_size_m: float = option(0.0, ge=0)
+    """Side of a voxel; 0 = a fortieth of the scene's median depth, from 1 cm to 10 cm"""
     truncation_distance_m: float = option(0.0, ge=0)
     """Distances are limited to this; 0 = three voxels"""
     min_ray_length_m: float = option(0.2, gt=0)
@@ -35,11 +35,6 @@ class FusionOptions(Options, prefix="dense_tsdf_"):
             raise FlagError(
                 "--dense_tsdf_min_ray_length_m must be below --dense_tsdf_max_ray_length_m"
             )
-
-    @property
-    def truncation_m(self) -> float:
-        """The truncation distance [m]."""
-        return self.truncation_distance_m or 3.0 * self.voxel_size_m
 
 
 class DistanceOptions(Options, prefix="dense_esdf_"):

@@ -9,6 +9,7 @@ from maplab_py.algorithms.keyframing.options import KeyframingOptions, Keyframin
 from maplab_py.distinct import distinct
 from maplab_py.geometry import se3
 from maplab_py.progress import SILENT, Progress
+from maplab_py.report import counted
 from maplab_py.vimap import VIMap, mission_mask, observation_counts, starts_of_counts
 from maplab_py.vimap.vertex_removal import remove_vertices_counted
 
@@ -66,18 +67,24 @@ def keyframe(
         imu_edges_dropped=removal.imu_edges_dropped,
         transformation_edges_dropped=removal.transformation_edges_dropped,
         resources_removed=removal.resources,
-        note=_note(undetermined, int(np.count_nonzero(had))),
+        note=_note(undetermined, int(np.count_nonzero(had)), removal.resources),
     )
     return result, report
 
 
-def _note(undetermined: int, landmarks: int) -> str:
-    if 2 * undetermined <= landmarks:
-        return ""
-    return (
-        f"{undetermined} of {landmarks} landmarks keep fewer than two observations and are bad until lc "
-        "merges them; a smaller --kf_every_nth_vertex or larger --kf_min_shared_landmarks_obs keeps more"
-    )
+def _note(undetermined: int, landmarks: int, resources: int) -> str:
+    notes = []
+    if 2 * undetermined > landmarks:
+        notes.append(
+            f"{undetermined} of {landmarks} landmarks keep fewer than two observations and are bad until lc "
+            "merges them; a smaller --kf_every_nth_vertex or larger --kf_min_shared_landmarks_obs keeps more"
+        )
+    if resources:
+        notes.append(
+            f"{counted(resources, 'image or depth map', 'images and depth maps')} of removed vertices went "
+            "with them: a dense map is better made before (undo; stereo_dense_reconstruction)"
+        )
+    return "; ".join(notes)
 
 
 def choose_keyframes(

@@ -57,15 +57,16 @@ def test_true_depth_gives_the_true_surfaces(room: StereoRoom, with_depth: VIMap)
     assert np.mean(off_m > 0.1) < 0.001
 
 
-def test_voxels_that_are_coarse_for_a_near_scene_are_told(
-    room: StereoRoom, with_depth: VIMap
-) -> None:
-    for voxel_m, is_told in ((0.05, False), (0.5, True)):
-        options = FusionOptions(voxel_size_m=voxel_m, integrate_every_nth=10)
-        _, report = fusion.fuse_depth(with_depth, room.map_folder, options=options)
-        assert (
-            any(f"voxels of {voxel_m:g} m are coarse" in note for note in report.notes) == is_told
-        )
+def test_voxels_suit_the_depth_of_the_scene(room: StereoRoom, with_depth: VIMap) -> None:
+    every = FusionOptions(integrate_every_nth=10)
+    _, report = fuse_depth(with_depth, room.map_folder, options=every)
+    (grid,) = report.grids
+    assert 0.0 < grid.depth_in_range <= 1.0
+    assert grid.median_depth_m / 80.0 < grid.voxel_size_m <= grid.median_depth_m / 40.0
+    near = dataclasses.replace(every, max_ray_length_m=0.6 * grid.median_depth_m)
+    _, of_near = fuse_depth(with_depth, room.map_folder, options=near)
+    assert of_near.grids[0].voxel_size_m < grid.voxel_size_m
+    assert of_near.grids[0].depth_in_range < grid.depth_in_range
 
 
 def test_the_grid_moves_with_its_mission(room: StereoRoom, with_depth: VIMap) -> None:
