@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from maplab_py.errors import UserError
 from maplab_py.output_files import check_writable, write_bytes
-from maplab_py.vimap import VIMap, to_hex_list
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,11 +29,6 @@ def new_figure(width_in: float = 8.0, height_in: float = 6.0) -> Figure:
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
-
-
-def mission_names(vi_map: VIMap) -> list[str]:
-    """Return short names of the missions: the first eight digits of their ids."""
-    return [name[:8] for name in to_hex_list(vi_map.missions.id)]
 
 
 def mission_colour(row: int) -> Any:

@@ -11,13 +11,18 @@ from maplab_py.errors import UserError
 from maplab_py.plotting import figure as figures
 from maplab_py.report import counted
 from maplab_py.vimap import LandmarkQuality, VIMap
-from maplab_py.vimap.queries import coobservation_counts, mission_mask, observation_counts
+from maplab_py.vimap.queries import (
+    coobservation_counts,
+    limits_from_above,
+    mission_labels,
+    mission_mask,
+    observation_counts,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_PERCENT_OF_LANDMARKS = (1.0, 99.0)  # a few lie far outside and would make the rest tiny
 _QUALITY_COLOURS = {"UNKNOWN": "tab:gray", "BAD": "tab:red", "GOOD": "tab:green"}
 
 
@@ -43,7 +48,12 @@ def trajectories(
     mission, p_G_I = vi_map.vertices.mission, vi_map.T_G_I[:, 4:]
     if not np.isin(mission, chosen).any():
         raise UserError("the map has no vertices to draw")
-    figure = figures.new_figure()
+    low, high = limits_from_above(vi_map, chosen)
+    if p_G_truth is not None:
+        low = np.minimum(low, p_G_truth[:, :2].min(axis=0))
+        high = np.maximum(high, p_G_truth[:, :2].max(axis=0))
+    width, height = (high - low).tolist()
+    figure = figures.new_figure(8.0, float(np.clip(8.0 * height / width, 2.5, 10.0)) + 0.7)
     axes = figure.subplots()
     if landmarks:
         _draw_landmarks(axes, vi_map, chosen)
@@ -51,10 +61,12 @@ def trajectories(
         axes.plot(*p_G_truth[:, :2].T, color="black", linewidth=0.8, label="truth")
     for row in chosen:
         x, y = p_G_I[mission == row, :2].T
-        name = figures.mission_names(vi_map)[row]
+        name = mission_labels(vi_map)[row]
         axes.plot(x, y, color=figures.mission_colour(int(row)), linewidth=1.5, label=name)
         axes.plot(x[:1], y[:1], "o", color=figures.mission_colour(int(row)), markersize=5)
-    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    axes.set_aspect("equal")
     unknown = np.count_nonzero(~vi_map.baseframes.is_known[vi_map.missions.baseframe[chosen]])
     note = f"; {unknown} of unknown base frame" if unknown else ""
     figures.label(
@@ -68,11 +80,7 @@ def _draw_landmarks(axes: Axes, vi_map: VIMap, chosen: NDArray[np.int64]) -> Non
     is_good = vi_map.landmarks.quality != LandmarkQuality.BAD
     in_chosen = np.isin(vi_map.vertices.mission[vi_map.landmarks.vertex], chosen)
     p_G = vi_map.p_G[figures.thinned(np.flatnonzero(is_good & in_chosen))]
-    if not len(p_G):
-        return
-    low, high = np.percentile(p_G, _PERCENT_OF_LANDMARKS, axis=0)
-    inside = ((p_G >= low) & (p_G <= high)).all(axis=1)
-    axes.plot(*p_G[inside, :2].T, ".", color="0.75", markersize=1.5, zorder=0)
+    axes.plot(*p_G[:, :2].T, ".", color="0.75", markersize=1.5, zorder=0)
 
 
 def landmark_histograms(vi_map: VIMap, missions: NDArray[np.int64] | None = None) -> Figure:
@@ -112,7 +120,7 @@ def coobservability(vi_map: VIMap) -> Figure:
     if not len(vi_map.missions):
         raise UserError("the map has no missions to draw")
     counts = coobservation_counts(vi_map)
-    names = figures.mission_names(vi_map)
+    names = mission_labels(vi_map)
     size_in = 3.5 + 0.45 * min(len(names), 40)
     figure = figures.new_figure(size_in + 1.0, size_in)
     axes = figure.subplots()

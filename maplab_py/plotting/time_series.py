@@ -13,8 +13,9 @@ from maplab_py.algorithms.evaluation.trajectory_evaluation import match
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.geometry import se3
 from maplab_py.interop.trajectories import Trajectory
-from maplab_py.plotting.figure import label, legend, mission_colour, mission_names, new_figure
+from maplab_py.plotting.figure import label, legend, mission_colour, new_figure
 from maplab_py.vimap import VIMap, mission_mask
+from maplab_py.vimap.queries import mission_labels
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -47,7 +48,7 @@ def errors_over_time(
     for row in np.unique(mission):
         of = mission == row
         time_s = (time_ns[of] - time_ns.min()) * 1e-9
-        name, colour = mission_names(vi_map)[row], mission_colour(row)
+        name, colour = mission_labels(vi_map)[row], mission_colour(row)
         axes[0].plot(time_s, error_m[of], color=colour, label=name)
         axes[2].plot(time_s, error_deg[of], color=colour)
         for axis, style in enumerate(("-", "--", ":")):
@@ -104,7 +105,7 @@ def inertial_states(vi_map: VIMap, mission: int) -> Figure:
     """
     rows = np.flatnonzero(vi_map.vertices.mission == mission)
     if not len(rows):
-        raise UserError(f"mission {mission_names(vi_map)[mission]} has no vertices to draw")
+        raise UserError(f"mission {mission_labels(vi_map)[mission]} has no vertices to draw")
     vertices = vi_map.vertices
     time_s = (vertices.timestamp_ns[rows] - vertices.timestamp_ns[rows[0]]) * 1e-9
     panels = (
@@ -119,7 +120,7 @@ def inertial_states(vi_map: VIMap, mission: int) -> Figure:
         for axis, colour in enumerate(_COLOURS):
             panel.plot(time_s, values[:, axis], color=colour, label="xyz"[axis])
         label(panel, "", name)
-    axes[0].set_title(f"mission {mission_names(vi_map)[mission]}")
+    axes[0].set_title(f"mission {mission_labels(vi_map)[mission]}")
     axes[-1].set_xlabel("time since the first vertex [s]")
     legend(axes[0], 3)
     return figure

@@ -10,7 +10,7 @@ from maplab_py.distinct import distinct
 from maplab_py.errors import UserError
 from maplab_py.sensors.sensor_set import OtherSensor
 from maplab_py.vimap.ids import SHORT_ID_DIGITS, distinct_prefixes, to_hex_list
-from maplab_py.vimap.tables import MissionSensor, ResourceOwner
+from maplab_py.vimap.tables import LandmarkQuality, MissionSensor, ResourceOwner
 from maplab_py.vimap.vi_map import VIMap
 
 
@@ -202,3 +202,22 @@ def is_metric(vi_map: VIMap, mission: int) -> bool:
     sensor_id = mission_sensor_id(vi_map, mission, MissionSensor.ODOMETRY_6DOF)
     sensor = vi_map.sensors.sensors.get(sensor_id)
     return not (isinstance(sensor, OtherSensor) and sensor.keys.get(ARBITRARY_SCALE) is True)
+
+
+_SHARE_SHOWN = (2.5, 97.5)  # percent: landmarks at large distances would make the rest tiny
+_MARGIN = 0.03
+
+
+def limits_from_above(vi_map: VIMap, missions: NDArray[Any] | None = None) -> tuple[F64, F64]:
+    """Return the corners (2,) and (2,) in G of a picture from above: all vertices and 95 % of the landmarks.
+
+    Landmarks that are judged bad do not count.
+    """
+    p_G = vi_map.T_G_I[mission_mask(vi_map, missions)[vi_map.vertices.mission], 4:6]
+    good = vi_map.landmarks.quality != LandmarkQuality.BAD
+    landmarks = vi_map.p_G[landmark_mask(vi_map, missions) & good, :2]
+    if len(landmarks):
+        p_G = np.concatenate([p_G, np.percentile(landmarks, _SHARE_SHOWN, axis=0)])
+    low, high = p_G.min(axis=0), p_G.max(axis=0)
+    margin = _MARGIN * max(float((high - low).max()), 0.1)
+    return low - margin, high + margin
