@@ -29,6 +29,8 @@ from maplab_py.storage.unchanged_files import TakenOver, WrittenFiles
 from maplab_py.vimap import VIMap, number_repair
 
 RESOURCES = "resources"
+CARD_FILE = "card.html"
+"""The origin of a map, which a session writes; another map must not keep it."""
 _GZIP_LEVEL = 1
 
 
@@ -234,7 +236,7 @@ def _keep(old: Path, new: Path, linked: set[Path]) -> None:
     if not old.is_dir():
         return
     for entry in os.scandir(old):
-        belongs = entry.name in (checksums.FILE_NAME, mission_names.FILE_NAME)
+        belongs = entry.name in (checksums.FILE_NAME, mission_names.FILE_NAME, CARD_FILE)
         if not belongs and not (new / entry.name).exists():
             _bring(entry, new / entry.name, linked)
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import weakref
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from maplab_py.algorithms.evaluation import reports
 from maplab_py.algorithms.evaluation.options import TrajectoryEvaluationOptions
+from maplab_py.console.session.session import MEASURED
 from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, UserError, command
 
 if TYPE_CHECKING:
@@ -61,6 +63,10 @@ def evaluate_trajectory(
     key = ("evaluate_trajectory", context.map_key, str(ground_truth), options, chosen)
     before = context.session.results.get(key)
     context.session.results[key] = report
+    accuracy = f"RMSE {report.ape_m.rmse:.4f} m of {report.matched} vertices against {ground_truth}"
+    if chosen == ALL_MISSIONS:
+        value = (weakref.ref(context.vi_map), f"{accuracy} ({report.alignment})")
+        context.session.results[MEASURED, context.map_key] = value
     if reference is not None:
         errors = errors_of(reference).as_baseline(f"snapshot '{baseline}'")
     elif isinstance(before, reports.TrajectoryEvaluationReport):

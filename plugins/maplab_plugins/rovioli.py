@@ -47,6 +47,13 @@ _SECONDS_TO_DRAW = 20.0
     needs_map=False,
     acts_outside=True,
     guards_effects=True,
+    reads=(
+        "datasource_folder",
+        "datasource_rosbag",
+        "sensor_calibration_file",
+        "imu_calibration_file",
+        "vio_localization_map_folder",
+    ),
     see_also=(
         "check_recording",
         "recording_info",

@@ -42,7 +42,7 @@ def compare_maps(first: VIMap, second: VIMap) -> MapComparisonReport:
     keypoints = _common_keypoints(first, second, *common["frames"])
     rows.append(_observations(first, second, *keypoints))
     position, rotation = _poses(first, second, *common["vertices"])
-    return MapComparisonReport(
+    report = MapComparisonReport(
         rows=tuple(rows),
         position_m=position,
         rotation_deg=rotation,
@@ -61,6 +61,43 @@ def compare_maps(first: VIMap, second: VIMap) -> MapComparisonReport:
         sensors_differing=_sensors(first, second),
         is_identical=_is_identical(first, second),
     )
+    return dataclasses.replace(report, in_words=_in_words(report))
+
+
+def _in_words(report: MapComparisonReport) -> str:
+    """Return the differences as sentences, the important first."""
+    if report.is_identical:
+        return "the maps are identical to the last bit"
+    if report.position_m.is_empty:
+        return "no vertex is in both maps: they are of other recordings, or one has new ids"
+    parts = [
+        f"{row.what}: {row.in_both} in both, {row.only_in_first} only in this map, "
+        f"{row.only_in_second} only in the other"
+        for row in report.rows
+        if row.only_in_first or row.only_in_second
+    ]
+    position, rotation = report.position_m, report.rotation_deg
+    moved = max(position.largest, rotation.largest) > _ROUNDING
+    parts.append(
+        f"vertices moved by {_millimetres(position.rmse)} (RMSE), at most "
+        f"{_millimetres(position.largest)} and {rotation.largest:.2g} deg"
+        if moved
+        else "the vertices are at the same poses"
+    )
+    if report.landmark_position_m.largest > 0.0:
+        parts.append(f"landmarks moved by {_millimetres(report.landmark_position_m.rmse)} (RMSE)")
+    if report.landmarks_of_other_quality:
+        parts.append(f"{report.landmarks_of_other_quality} landmarks are judged differently")
+    if report.sensors_differing:
+        parts.append(f"calibrations differ: {', '.join(report.sensors_differing)}")
+    if not report.keypoint_px.is_empty and report.keypoint_px.largest > 0.0:
+        parts.append(f"keypoints differ by up to {report.keypoint_px.largest:.2g} px")
+    return "; ".join(parts)
+
+
+def _millimetres(distance_m: float) -> str:
+    """Return a distance in the unit that reads best."""
+    return f"{1e3 * distance_m:.3g} mm" if distance_m < 1.0 else f"{distance_m:.3g} m"
 
 
 def common_rows(a: IdArray, b: IdArray) -> tuple[I64, I64]:

@@ -226,3 +226,4 @@ class MapComparisonReport(Report):
     descriptors_differing: int
     sensors_differing: tuple[str, ...]
     is_identical: bool
+    in_words: str = ""

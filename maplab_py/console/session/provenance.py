@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import weakref
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +19,7 @@ from maplab_py.console.session.call import Call
 from maplab_py.console.session.maps import MapEntry, MapsState
 
 if TYPE_CHECKING:
+    from maplab_py.console.session.cards import CardInput
     from maplab_py.vimap import VIMap
 
 
@@ -30,6 +31,8 @@ class ScriptLine:
     text: str  # with every value that is not the default
     selected_before: str  # key of the map that the command worked on; empty = none
     selected_after: str
+    inputs: tuple[CardInput, ...] = dataclasses.field(default=(), compare=False)
+    outputs: tuple[str, ...] = dataclasses.field(default=(), compare=False)
 
 
 Script = tuple[ScriptLine, ...]
@@ -56,7 +59,15 @@ class Provenance:
         if not unknown:
             return
         before = base.selected if call.command.needs_map else ""
-        line = ScriptLine(next(self._numbers), _text(call), before, result.selected)
+        from maplab_py.console.session.cards import input_of
+
+        paths = {name: path for name, path in call.values.items() if isinstance(path, Path)}
+        inputs = tuple(input_of(paths[name]) for name in call.command.reads if name in paths)
+        outputs = tuple(
+            str(path.absolute()) for name, path in paths.items() if name not in call.command.reads
+        )
+        text, number = _text(call), next(self._numbers)
+        line = ScriptLine(number, text, before, result.selected, inputs, outputs)
         named = {value for value in call.values.values() if isinstance(value, str)}
         removed = base.entries.keys() - result.entries.keys()
         read = {before} | named | removed | {entry.key for entry in unknown}
@@ -77,6 +88,28 @@ class Provenance:
         key, script = next(iter(scripts.items()))  # the map was renamed since
         line = ScriptLine(script[-1].number, f"rename_map {entry.key}", key, entry.key)
         return (*script, line)
+
+    def write_cards(
+        self, base: MapsState, result: MapsState, accuracy_of: Callable[[MapEntry], str]
+    ) -> None:
+        """Write the cards of the maps that a command has saved.
+
+        Raises:
+            OSError: One cannot be written.
+        """
+        from maplab_py.console.session.cards import write_card
+
+        known = {id(entry.disk_copy) for entry in base.entries.values()}
+        for entry in result.entries.values():
+            copy, script = entry.disk_copy, self.script_of(entry)
+            if copy is None or not entry.is_saved or id(copy) in known or not script:
+                continue
+            inputs = tuple(dict.fromkeys(given for line in script for given in line.inputs))
+            read = {Path(given.path).resolve() for given in script[-1].inputs}
+            if not copy.fingerprint or not read.isdisjoint((copy.folder, *copy.folder.parents)):
+                continue  # it was loaded
+            outputs = tuple(dict.fromkeys(path for line in script for path in line.outputs))
+            write_card(entry, script_text(script), inputs, outputs, accuracy_of(entry))
 
 
 def script_text(script: Script) -> list[str]:

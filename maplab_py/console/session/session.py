@@ -20,7 +20,7 @@ from maplab_py.console.commands.registry import Registry, load_registry
 from maplab_py.console.session.call import Call, call_from_keywords, call_from_words
 from maplab_py.console.session.context import CommandContext
 from maplab_py.console.session.jobs import Job, JobBoard
-from maplab_py.console.session.maps import MapManager, MapsState, merge_states
+from maplab_py.console.session.maps import MapEntry, MapManager, MapsState, merge_states
 from maplab_py.console.session.provenance import Provenance
 from maplab_py.console.session.settings import Layer, Setting, Settings
 from maplab_py.console.terminal.protocol import SilentTerminal, Terminal
@@ -36,6 +36,9 @@ from functools import partial
 from typing import TYPE_CHECKING, Protocol, TypeVar, runtime_checkable
 
 from maplab_py.console.session.log import log_path
+
+MEASURED = "accuracy"
+"""Key in `Session.results`, with that of a map: a weak reference to its value, and its accuracy in words."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -257,7 +260,18 @@ class Session:
         if call.is_trial:
             return report, base
         self.provenance.record(call, base, draft.maps.state)
+        try:
+            self.provenance.write_cards(base, draft.maps.state, self._accuracy_of)
+        except OSError as error:
+            terminal.warning(f"the card of the saved map cannot be written: {error}")
         return report, draft.maps.state
+
+    def _accuracy_of(self, entry: MapEntry) -> str:
+        """Return the accuracy of the present value of a map if it was measured; see `MEASURED`."""
+        measured = self.results.get((MEASURED, entry.key))
+        if not isinstance(measured, tuple) or measured[0]() is not entry.vi_map:
+            return ""
+        return str(measured[1])
 
     def start(self, command: str, *words: str, **flags: Any) -> Job:
         """Start a command in the background; see `run`. The job knows its state and its report."""

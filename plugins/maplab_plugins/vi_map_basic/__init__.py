@@ -37,6 +37,7 @@ from maplab_plugins.vi_map_basic.maps import (
     snapshot,
     undo,
 )
+from maplab_plugins.vi_map_basic.reproduction import reproduce
 from maplab_plugins.vi_map_basic.resources import (
     clean_up_resource_folders,
     list_resource_folders,
@@ -79,6 +80,7 @@ __all__ = [
     "redo",
     "remove_resources",
     "rename_map",
+    "reproduce",
     "resource_cache_statistics",
     "resource_statistics",
     "restore",
