@@ -47,7 +47,7 @@ class SceneDepth:
         used = values[(values >= options.min_ray_length_m) & (values <= options.max_ray_length_m)]
         return cls(
             float(np.median(used)) if len(used) else 0.0,
-            len(used) / max(np.count_nonzero(values), 1),
+            len(used) / max(int(np.count_nonzero(values)), 1),
         )
 
 

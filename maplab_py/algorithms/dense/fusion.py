@@ -124,8 +124,11 @@ def fuse_depth(
         new.add(GRID_TYPE, encode_grid(StoredGrid(grid, fused)))
         owners.append(group[0])
         report = _report(vi_map, group, grid, len(resources), len(resources), 0)
-        depth_facts = {"median_depth_m": scene.median_m, "depth_in_range": scene.share_in_range}
-        reports.append(dataclasses.replace(report, **depth_facts))
+        reports.append(
+            dataclasses.replace(
+                report, median_depth_m=scene.median_m, depth_in_range=scene.share_in_range
+            )
+        )
     kept = without_resources(vi_map, former)
     result = new.attached(kept, np.arange(len(new)), owners, ResourceOwner.MISSION)
     return result, FusionReport(resource_type(kind).name, tuple(reports), tuple(notes))

@@ -263,7 +263,7 @@ class Session:
         try:
             self.provenance.write_cards(base, draft.maps.state, self._accuracy_of)
         except OSError as error:
-            terminal.warning(f"the card of the saved map cannot be written: {error}")
+            terminal.note(f"the card of the saved map cannot be written: {error}")
         return report, draft.maps.state
 
     def _accuracy_of(self, entry: MapEntry) -> str:

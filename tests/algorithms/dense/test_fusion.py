@@ -9,6 +9,7 @@ import pytest
 
 from maplab_py.algorithms.dense import fusion, meshing, pinhole
 from maplab_py.algorithms.dense.clouds import convert_depth_maps
+from maplab_py.algorithms.dense.depth_inputs import SceneDepth, grid_settings
 from maplab_py.algorithms.dense.field import create_fields
 from maplab_py.algorithms.dense.grid import GridSettings, Mesh, TsdfGrid
 from maplab_py.algorithms.dense.options import FusionOptions
@@ -57,16 +58,24 @@ def test_true_depth_gives_the_true_surfaces(room: StereoRoom, with_depth: VIMap)
     assert np.mean(off_m > 0.1) < 0.001
 
 
-def test_voxels_suit_the_depth_of_the_scene(room: StereoRoom, with_depth: VIMap) -> None:
+@pytest.mark.parametrize(
+    ("depth_m", "voxel_m"), [(0.0, 0.01), (0.65, 0.015), (2.0, 0.05), (3.9, 0.075), (50.0, 0.1)]
+)
+def test_voxels_suit_the_depth_of_the_scene(depth_m: float, voxel_m: float) -> None:
+    scene = SceneDepth(depth_m, 1.0)
+    settings = grid_settings(FusionOptions(), scene)
+    assert (settings.voxel_size_m, settings.truncation_m) == (voxel_m, 3.0 * voxel_m)
+    assert grid_settings(FusionOptions(voxel_size_m=0.07), scene).voxel_size_m == 0.07
+
+
+def test_the_depth_of_a_scene_is_reported(room: StereoRoom, with_depth: VIMap) -> None:
     every = FusionOptions(integrate_every_nth=10)
-    _, report = fuse_depth(with_depth, room.map_folder, options=every)
-    (grid,) = report.grids
-    assert 0.0 < grid.depth_in_range <= 1.0
+    (grid,) = fuse_depth(with_depth, room.map_folder, options=every)[1].grids
+    assert grid.depth_in_range == 1.0
     assert grid.median_depth_m / 80.0 < grid.voxel_size_m <= grid.median_depth_m / 40.0
-    near = dataclasses.replace(every, max_ray_length_m=0.6 * grid.median_depth_m)
-    _, of_near = fuse_depth(with_depth, room.map_folder, options=near)
-    assert of_near.grids[0].voxel_size_m < grid.voxel_size_m
-    assert of_near.grids[0].depth_in_range < grid.depth_in_range
+    near = dataclasses.replace(every, max_ray_length_m=grid.median_depth_m)
+    (of_near,) = fuse_depth(with_depth, room.map_folder, options=near)[1].grids
+    assert of_near.depth_in_range == pytest.approx(0.5, abs=0.1)
 
 
 def test_the_grid_moves_with_its_mission(room: StereoRoom, with_depth: VIMap) -> None:
