@@ -30,7 +30,7 @@ def keyframe_heuristic(
 )
 def landmark_sparsify(
     context: CommandContext,
-    num_landmarks_to_keep: int = -1,
+    num_landmarks_to_keep: int,
     *,
     options: SparsificationOptions = SparsificationOptions(),
     coverage_csv: Path | None = None,
@@ -48,9 +48,7 @@ def landmark_sparsify(
     from maplab_py.vimap.ids import to_hex_list
 
     if num_landmarks_to_keep <= 0:
-        raise UserError(
-            "the number of landmarks to keep is missing: give --num_landmarks_to_keep=N, N > 0"
-        )
+        raise UserError(f"--num_landmarks_to_keep={num_landmarks_to_keep}: wants a number above 0")
     if coverage_csv is not None:
         check_writable(coverage_csv, overwrite=overwrite)
     result, report, coverage = sparsify(

@@ -43,8 +43,10 @@ def test_sparsification_keeps_as_many_as_it_is_told(session: Session, tmp_path: 
 
 
 def test_sparsification_asks_for_a_number(session: Session, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="--num_landmarks_to_keep=N"):
+    with pytest.raises(UserError, match="needs --num_landmarks_to_keep="):
         session.run("landmark_sparsify")
+    with pytest.raises(UserError, match="--num_landmarks_to_keep=0: wants a number above 0"):
+        session.run("landmark_sparsify", num_landmarks_to_keep=0)
     table = tmp_path / "coverage.csv"
     table.write_text("mine")
     with pytest.raises(UserError, match="overwrite"):
