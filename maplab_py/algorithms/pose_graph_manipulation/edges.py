@@ -82,7 +82,8 @@ def assign_switch_variables(
 def _loop_closures(vi_map: VIMap) -> LoopClosureEdges:
     if len(vi_map.loop_closure_edges) == 0:
         raise UserError(
-            "the map has no loop closure edge: see lc --lc_insert_lc_edge_instead_of_merging"
+            "the map has no loop closure edge: see lc --lc_insert_lc_edge_instead_of_merging",
+            remedy="lc --lc_insert_lc_edge_instead_of_merging",
         )
     return vi_map.loop_closure_edges
 

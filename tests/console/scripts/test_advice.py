@@ -183,10 +183,11 @@ def remedies() -> Iterator[str]:
 
 def test_remedies_of_errors_are_commands_that_need_no_more() -> None:
     session = Session()
-    lines = {line for line in remedies() if line in session.registry.names}
+    names = session.registry.names
+    lines = {line for line in remedies() if line.partition(" ")[0] in names}
     assert {"retriangulate_landmarks", "loopclosure_all_missions"} <= lines
     for line in lines:
-        assert session.parse([line]).command.name == line
+        session.parse(line.split()).arguments()
 
 
 @pytest.fixture(scope="module")
