@@ -70,11 +70,11 @@ def test_voxels_suit_the_depth_of_the_scene(depth_m: float, voxel_m: float) -> N
 
 def test_the_depth_of_a_scene_is_reported(room: StereoRoom, with_depth: VIMap) -> None:
     every = FusionOptions(integrate_every_nth=10)
-    (grid,) = fuse_depth(with_depth, room.map_folder, options=every)[1].grids
+    (grid,) = fusion.fuse_depth(with_depth, room.map_folder, options=every)[1].grids
     assert grid.depth_in_range == 1.0
     assert grid.median_depth_m / 80.0 < grid.voxel_size_m <= grid.median_depth_m / 40.0
     near = dataclasses.replace(every, max_ray_length_m=grid.median_depth_m)
-    (of_near,) = fuse_depth(with_depth, room.map_folder, options=near)[1].grids
+    (of_near,) = fusion.fuse_depth(with_depth, room.map_folder, options=near)[1].grids
     assert of_near.depth_in_range == pytest.approx(0.5, abs=0.1)
 
 
