@@ -60,7 +60,7 @@ PREPARED = {
     "merge_map": "load_all maps; select_map v1_01",
     "select_map": "load_all maps",
     "rename_map": MERGED,
-    "reproduce": f"{MERGED}; save --map_folder=maps/merged",
+    "reproduce": f"{MERGED}; save --map_folder=merged",
     "join_all_maps": "load_all maps",
     "anchor_mission": f"{MERGED}; sbk --map_mission=a1; ",
     "anchor_all_missions": f"{MERGED}; sbk --map_mission=59f0",

@@ -36,7 +36,7 @@ class Reproduction(Report):
 
 @command(
     "reproduce",
-    example="reproduce maps/merged",
+    example="reproduce merged",
     needs_map=False,
     acts_outside=True,
     guards_effects=True,

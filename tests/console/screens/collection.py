@@ -144,7 +144,7 @@ class Collection:
 
     def _prepare(self, runner: Runner, name: str, lines: str) -> None:
         """Run the lines that precede a line; those that most lines need only once."""
-        if lines.startswith(MERGED) and not name.startswith(("history", "undo")):
+        if lines.startswith(MERGED) and not name.startswith(("history", "undo", "reproduce")):
             if self._merged is None:
                 _run(runner, MERGED)
                 self._merged = runner.session.maps.state
