@@ -70,12 +70,8 @@ def _in_words(report: MapComparisonReport) -> str:
         return "the maps are identical to the last bit"
     if report.position_m.is_empty:
         return "no vertex is in both maps: they are of other recordings, or one has new ids"
-    parts = [
-        f"{row.what}: {row.in_both} in both, {row.only_in_first} only in this map, "
-        f"{row.only_in_second} only in the other"
-        for row in report.rows
-        if row.only_in_first or row.only_in_second
-    ]
+    parts = [_counts_in_words(row) for row in report.rows if row.what in _TOLD]
+    parts = [part for part in parts if part]
     position, rotation = report.position_m, report.rotation_deg
     moved = max(position.largest, rotation.largest) > _ROUNDING
     parts.append(
@@ -93,6 +89,20 @@ def _in_words(report: MapComparisonReport) -> str:
     if not report.keypoint_px.is_empty and report.keypoint_px.largest > 0.0:
         parts.append(f"keypoints differ by up to {report.keypoint_px.largest:.2g} px")
     return "; ".join(parts)
+
+
+_TOLD = ("missions", "vertices", "landmarks", "observations")
+
+
+def _counts_in_words(row: RowCounts) -> str:
+    """Return which map has more rows of a table; an empty text if both have the same."""
+    if not (row.only_in_first or row.only_in_second):
+        return ""
+    if not row.only_in_second:
+        return f"this map has {row.only_in_first} more {row.what}"
+    if not row.only_in_first:
+        return f"the other map has {row.only_in_second} more {row.what}"
+    return f"{row.only_in_first} {row.what} are only in this map and {row.only_in_second} only in the other"
 
 
 def _millimetres(distance_m: float) -> str:

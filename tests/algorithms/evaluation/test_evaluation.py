@@ -335,6 +335,7 @@ def test_raw_euroc_submaps(relative: str, matched: int, rmse: float) -> None:
 def test_a_map_equals_itself() -> None:
     report = map_comparison.compare_maps(make_map(), make_map())
     assert report.is_identical
+    assert report.in_words == "the maps are identical to the last bit"
     assert all(row.only_in_first == row.only_in_second == 0 for row in report.rows)
     assert report.position_m.largest == report.keypoint_px.largest == 0.0
     assert (report.descriptors_differing, report.sensors_differing) == (0, ())
@@ -359,6 +360,9 @@ def test_every_difference_is_measured() -> None:
     )
     report = map_comparison.compare_maps(first, second)
     assert not report.is_identical
+    assert "this map has 1 more observations; vertices moved by" in report.in_words
+    assert "at most 300 mm and 2 deg" in report.in_words
+    assert "1 landmarks are judged differently" in report.in_words
     assert report.position_m.largest == pytest.approx(0.3)
     assert report.rotation_deg.largest == pytest.approx(2.0)
     assert report.keypoint_px.largest == pytest.approx(5.0)
