@@ -5,6 +5,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from maplab_py.errors import UserError
+from maplab_py.storage.map_saving import CARD_FILE
 
 
 def program_version() -> str:
@@ -16,7 +17,9 @@ def program_version() -> str:
 
 
 def folder_hash(folder: Path) -> str:
-    """Return the SHA-256 of the names and contents of all files below a folder, hidden ones apart.
+    """Return the SHA-256 of the names and contents of all files below a folder.
+
+    Hidden files, and the cards of maps, which have paths, do not count.
 
     Raises:
         UserError: A file cannot be read, or there is no such folder.
@@ -27,7 +30,8 @@ def folder_hash(folder: Path) -> str:
     try:
         for path in sorted(folder.rglob("*")):
             inner = path.relative_to(folder)
-            if any(part.startswith(".") for part in inner.parts) or not path.is_file():
+            is_hidden = any(part.startswith(".") for part in inner.parts)
+            if is_hidden or path.name == CARD_FILE or not path.is_file():
                 continue
             with path.open("rb") as file:
                 content = hashlib.file_digest(file, "sha256").digest()

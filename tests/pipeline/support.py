@@ -5,6 +5,7 @@ import os
 from pathlib import Path
 
 from maplab_py.pipeline import Pipeline, Stage
+from maplab_py.storage.map_saving import CARD_FILE
 from maplab_py.storage.native import save_map
 from tests.vimap.builders import walk_map
 
@@ -33,11 +34,13 @@ def pipeline(maps: tuple[Path, ...], *stages: Stage) -> Pipeline:
 
 
 def contents(folder: Path) -> dict[str, str]:
-    """Return the hash of every file of the results, logs and records apart."""
+    """Return the hash of every file of the results; logs, records and cards, with paths, apart."""
     return {
         path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in sorted(folder.rglob("*"))
-        if path.is_file() and "tasks" not in path.relative_to(folder).parts
+        if path.is_file()
+        and path.name != CARD_FILE
+        and "tasks" not in path.relative_to(folder).parts
     }
 
 

@@ -40,6 +40,15 @@ def test_trajectories_are_where_the_vertices_are(vi_map: VIMap) -> None:
     (with_landmarks,) = maps.trajectories(vi_map).axes
     assert len(curves(with_landmarks)) == 2
     assert "1 of unknown base frame" in with_landmarks.get_title()
+    (low, high), (bottom, top) = with_landmarks.get_xlim(), with_landmarks.get_ylim()
+    x, y = vi_map.T_G_I[:, 4:6].T
+    assert low < x.min() < x.max() < high
+    assert bottom < y.min() < y.max() < top
+    far = np.array(vi_map.landmarks.p_I)
+    far[0] = 1e4
+    distant = vi_map.replace(landmarks=vi_map.landmarks.replace(p_I=far))
+    (with_distant,) = maps.trajectories(distant).axes
+    assert with_distant.get_xlim()[1] < 100.0
     with pytest.raises(UserError, match="no vertices"):
         maps.trajectories(VIMap())
 
