@@ -15,6 +15,7 @@ from pathlib import Path
 import pyte
 import pytest
 
+from maplab_py import kernel_cache
 from maplab_py.cancellation import check_cancelled, current_token, ending_early, lasting_effect
 from maplab_py.console.commands.command import describe
 from maplab_py.console.commands.registry import Plugin
@@ -389,6 +390,24 @@ def lines(width: int, what: str, total: float, monkeypatch: pytest.MonkeyPatch) 
     shown = [line.rstrip() for line in screen.display if line.strip()]
     progress.close()
     return shown
+
+
+def test_a_command_that_waits_for_a_compilation_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    stream = _Terminal()
+    progress = TerminalProgress(stream, what="rovioli")
+    progress._start -= 2 * SECONDS_BEFORE_BAR
+    before_s = kernel_cache.seconds()
+    with kernel_cache.compilation():
+        kernel_cache.is_compiling.set()
+        progress.tick()
+        assert progress._bar is not None
+        assert progress._bar.tasks[0].description == "compiling kernels, once"
+    progress.tick()
+    assert progress._bar.tasks[0].description == "rovioli"
+    progress.close()
+    assert kernel_cache.seconds() > before_s
 
 
 @pytest.mark.parametrize("width", [60, 80, 120])
