@@ -25,6 +25,8 @@ _LANDMARK_DAMPING = 1e-12
 _CONVERGED = ("cost has converged", "no more decrease is expected", "step is small")
 _MIN_OBSERVATIONS = 3000
 _DIRECT = "multifrontal"
+_STRONG_GAIN, _STRONG_SHARE = 3.0, 0.5
+"""A gain of so many times the least makes do with this share of the least change: no true calibration has it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -189,10 +191,12 @@ def _chosen(step: _Step, known: list[int]) -> list[str]:
             # a line delay moves the time of whole images: it is judged with their delay
             change, gain = step.of([*chosen, k, 0] if k == 1 else [*chosen, k])
             in_units = np.abs(change / step.units)[step.group == k].max(initial=0.0)
-            if in_units >= group.least_change:
-                wanted[k] = (gain - reached) / group.least_gain
+            strength = (gain - reached) / group.least_gain
+            share = _STRONG_SHARE if strength >= _STRONG_GAIN else 1.0
+            if strength >= 1.0 and in_units >= share * group.least_change:
+                wanted[k] = gain
         best = max(wanted, key=wanted.__getitem__, default=-1)
-        if best < 0 or wanted[best] < 1.0:
+        if best < 0:
             return [_GROUPS[k].flag for k in chosen]
         chosen += [best, 0] if best == 1 and 0 not in chosen else [best]
 
