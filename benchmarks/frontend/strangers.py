@@ -10,6 +10,7 @@ does not start.
 
 import argparse
 import dataclasses
+import functools
 import json
 import sys
 from collections.abc import Callable
@@ -20,16 +21,19 @@ import numpy as np
 from benchmarks.frontend.sequences import TRUTH, position_errors
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
+from maplab_py.array_types import I64
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.frontend.checked_run import run_checked
 from maplab_py.frontend.finishing import finish
 from maplab_py.frontend.mapping import Mapping
 from maplab_py.frontend.odometry_update import OdometryUpdate
+from maplab_py.geometry import se3, so3
 from maplab_py.interop.images import Pixels
 from maplab_py.interop.recordings.options import SourceOptions
-from maplab_py.interop.recordings.protocol import CameraImage, Recording
+from maplab_py.interop.recordings.protocol import CameraImage, RecordedSensors, Recording
 from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.trajectories import Trajectory, read_trajectory
+from maplab_py.sensors import CameraRig
 from maplab_py.simulation.raw_data import write_raw_data
 from maplab_py.simulation.scenario import CameraOptions, MotionOptions, Scenario, SessionOptions
 from maplab_py.simulation.scenario_file import load_scenario
@@ -225,11 +229,72 @@ class Run:
     path_m: float = 0.0
     missions: int = 0
     error_px: float = np.nan  # median over the frames of the window's median reprojection error
+    calibration: CalibrationErrors | None = None  # of the map
     says: tuple[str, ...] = ()
 
 
+@dataclasses.dataclass(frozen=True)
+class CalibrationErrors:
+    """Largest errors of the calibration of a map over its cameras."""
+
+    rotation_deg: float
+    position_mm: float
+    offset_ms: float  # of the middle row
+    line_delay_ms: float  # from the first row to the last
+    focal_percent: float
+    centre_px: float
+
+    @property
+    def words(self) -> str:
+        """Return the errors in one line."""
+        return (
+            f"{self.rotation_deg:.2f} deg, {self.position_mm:.1f} mm, offset {self.offset_ms:.2f} ms, rows "
+            f"{self.line_delay_ms:.2f} ms, focal {self.focal_percent:.2f} %, centre {self.centre_px:.2f} px"
+        )
+
+
+def calibration_errors(vi_map: VIMap, sound: RecordedSensors, taken_ns: I64) -> CalibrationErrors:
+    """Return the errors of the calibration of a map.
+
+    Args:
+        vi_map: The map.
+        sound: The true calibration; images are stamped at their middle rows.
+        taken_ns: When the images were taken by the clock of the IMU.
+    """
+    assert sound.imu is not None
+    T_I_C = vi_map.sensors.T_I_C(sound.imu.id, sound.rig.id)
+    rig = vi_map.sensors.sensors[sound.rig.id]
+    assert isinstance(rig, CameraRig)
+    pairs = list(zip(rig.cameras, sound.cameras, strict=True))
+    off = se3.compose(se3.inverse(sound.T_I_C), T_I_C)
+    heights = np.array([camera.height_px for camera, _ in pairs])
+    line_s = np.array([1e-9 * camera.line_delay_ns for camera, _ in pairs])
+    true_line_s = np.array([1e-9 * camera.line_delay_ns for _, camera in pairs])
+    times_ns = np.sort(taken_ns)
+    after = np.searchsorted(times_ns, vi_map.vertices.timestamp_ns).clip(1, len(times_ns) - 1)
+    early_ns = vi_map.vertices.timestamp_ns - times_ns[[after - 1, after]]
+    of_vertices_s = 1e-9 * np.median(np.where(-early_ns[1] < early_ns[0], early_ns[1], early_ns[0]))
+    delays_s = np.array([camera.image_delay_s for camera, _ in pairs]) + 0.5 * heights * line_s
+    focal = [c.intrinsics[:2] / true.intrinsics[:2] - 1.0 for c, true in pairs]
+    centre = [c.intrinsics[2:4] - true.intrinsics[2:4] for c, true in pairs]
+    return CalibrationErrors(
+        float(np.degrees(np.linalg.norm(so3.log(off[:, :4]), axis=1).max())),
+        1e3 * float(np.linalg.norm(off[:, 4:], axis=1).max()),
+        1e3 * float(np.abs(delays_s + of_vertices_s).max()),
+        1e3 * float(np.abs(heights * (line_s - true_line_s)).max()),
+        1e2 * float(np.abs(focal).max()),
+        float(np.abs(centre).max()),
+    )
+
+
 def run(
-    recording: Recording, truth: Trajectory, *, is_optimised: bool, shift_s: float = 0.0
+    recording: Recording,
+    truth: Trajectory,
+    sound: RecordedSensors,
+    stamps_ns: I64,
+    *,
+    is_optimised: bool,
+    shift_s: float = 0.0,
 ) -> Run:
     """Run as `rovioli` does; then as `optvi --ba_calibration=auto` if wanted.
 
@@ -264,6 +329,7 @@ def run(
         path_m=mapping.statistics.distance_m,
         missions=len(vi_map.missions),
         error_px=float(np.nanmedian(errors_px)),
+        calibration=calibration_errors(vi_map, sound, stamps_ns + round(1e9 * shift_s)),
         says=tuple(notes),
     )
 
@@ -319,17 +385,20 @@ def main(words: list[str] | None = None) -> None:
             continue
         recording = open_recording(folder, SourceOptions())
         truth = read_trajectory(folder / TRUTH)
-        reference = run(stranger.sound(recording), truth, is_optimised=arguments.optvi)
-        faulty = run(
-            stranger.faulty(recording),
-            truth,
-            is_optimised=arguments.optvi,
-            shift_s=stranger.shift_s,
+        sound = stranger.sound(recording)
+        stamps = [int(file.stem) for file in folder.glob("**/cam0/data/*.*") if file.stem.isdigit()]
+        stamps_ns = np.array(stamps, dtype=np.int64)
+        run_one = functools.partial(
+            run, truth=truth, sound=sound.device, stamps_ns=stamps_ns, is_optimised=arguments.optvi
         )
+        reference = run_one(sound)
+        faulty = run_one(stranger.faulty(recording), shift_s=stranger.shift_s)
         ended = verdict(faulty, reference)
         sys.stdout.write(
             f"{seed:3d} {ended:18} {_figures(faulty, reference)}  [{stranger.words}]\n"
         )
+        if faulty.calibration is not None:
+            sys.stdout.write(f"      calibration off by {faulty.calibration.words}\n")
         for line in faulty.says:
             sys.stdout.write(f"      {line}\n")
         sys.stdout.flush()

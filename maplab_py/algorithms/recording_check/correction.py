@@ -1,12 +1,14 @@
 """A calibration with what a recording has shown: mounting, time offset, line delay, scale, noise."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from maplab_py.algorithms.recording_check import doctor, inertial_checks, turn_checks
 from maplab_py.algorithms.recording_check.findings import Finding, Verdict
+from maplab_py.algorithms.recording_check.rates import CameraTurns
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.device import RecordedSensors
 from maplab_py.sensors import CameraRig, Imu
@@ -14,6 +16,8 @@ from maplab_py.sensors.imu import ImuIntrinsics
 
 _MENDED = (Verdict.WRONG, Verdict.NOTE)
 _AXES = np.eye(3)
+_SAME_CLOCK_S, _SIGMAS = 2e-3, 4.0
+"""Cameras whose delays differ by no more, or by no more deviations, have one clock."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -55,8 +59,13 @@ def _corrected_rig(diagnosis: doctor.Diagnosis) -> tuple[CameraRig, list[str]]:
     rig, T_B_C = device.rig, device.rig.T_B_C.copy()
     models = list(rig.cameras)
     is_late = turn_checks.check_clock(diagnosis.cameras, rig.cameras).verdict in _MENDED
+    delays_s = _delays(diagnosis.cameras)
     for row, camera in enumerate(diagnosis.cameras):
         fit = camera.hand_eye
+        if is_late:
+            offset_ns = models[row].time_offset_ns + round(delays_s[row] * 1e9)
+            models[row] = dataclasses.replace(models[row], time_offset_ns=offset_ns)
+            notes.append(f"camera {row}: time offset {offset_ns * 1e-6:.1f} ms")
         if fit is None or not camera.agrees:
             continue
         if _verdicts(diagnosis, "rotation of the extrinsics, camera " + str(row)) or (
@@ -67,10 +76,6 @@ def _corrected_rig(diagnosis: doctor.Diagnosis) -> tuple[CameraRig, list[str]]:
             T_B_C[row] = se3.compose(T_B_C[row], np.concatenate([turn, np.zeros(3)]))
             angle = float(np.degrees(np.linalg.norm(so3.log(turn))))
             notes.append(f"camera {row}: turned by {angle:.1f} deg (T_B_C)")
-        if is_late:
-            offset_ns = models[row].time_offset_ns + round(fit.delay_s * 1e9)
-            models[row] = dataclasses.replace(models[row], time_offset_ns=offset_ns)
-            notes.append(f"camera {row}: time offset {offset_ns * 1e-6:.1f} ms")
         if _verdicts(diagnosis, f"shutter of camera {row}"):
             line_ns = round(fit.readout_s * 1e9 / models[row].height_px)
             models[row] = dataclasses.replace(
@@ -80,6 +85,26 @@ def _corrected_rig(diagnosis: doctor.Diagnosis) -> tuple[CameraRig, list[str]]:
             )
             notes.append(f"camera {row}: line delay {line_ns} ns")
     return dataclasses.replace(rig, cameras=tuple(models), T_B_C=T_B_C), notes
+
+
+def _delays(cameras: Sequence[CameraTurns]) -> list[float]:
+    """Return the delays of the images [s], the same for all cameras that have the first one's clock.
+
+    With delays that differ by their errors, images taken together would not be partners any more.
+    """
+    fits = [camera.hand_eye if camera.agrees else None for camera in cameras]
+    first = fits[0]
+    if first is None:
+        return [0.0] * len(fits)
+    common = []
+    for fit in fits:
+        if fit is not None:
+            sigma_s = np.hypot(fit.delay_sigma_s, first.delay_sigma_s)
+            if abs(fit.delay_s - first.delay_s) <= max(_SAME_CLOCK_S, _SIGMAS * sigma_s):
+                common.append(fit)
+    weights = [1.0 / max(fit.delay_sigma_s, 1e-6) ** 2 for fit in common]
+    mean_s = float(np.average([fit.delay_s for fit in common], weights=weights))
+    return [mean_s if fit is None or fit in common else fit.delay_s for fit in fits]
 
 
 def _corrected_imu(diagnosis: doctor.Diagnosis, imu: Imu) -> tuple[Imu, list[str]]:

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from maplab_py.algorithms.recording_check import inertial, rates, turns
+from maplab_py.algorithms.recording_check import inertial, rates
 from maplab_py.algorithms.recording_check.findings import Finding, Verdict, ok, unknown
 from maplab_py.algorithms.recording_check.signals import Signals
 from maplab_py.array_types import F64
@@ -23,6 +23,8 @@ _UNIT_TOLERANCE, _NOTED = 0.2, 0.11
 """Deviation of the magnitude from g as a share of it: of another unit, and that is noted."""
 _WITHOUT_GRAVITY_MPS2 = 3.0
 _DISAGREE, _LEAST_SPREAD = 1.3, 0.03
+_UNLIKE = 1.2
+"""Ratio of the spreads of gravity by two axes of the accelerometer, from which one of them is right."""
 _TOO_SMALL, _TOO_LARGE, _LARGE = 6.0, 18.0, 5.0
 """Ratios of noise densities measured and given; larger figures only make an estimate more careful."""
 _FASTEST_RADPS = 12.0
@@ -120,14 +122,13 @@ def raw_axes_agree(signals: Signals, accel: F64, camera: rates.CameraTurns) -> b
     """
     if camera.gyro is None:
         return None
-    as_exchanged = camera.gyro.shifted(-camera.bias)
-    times_ns, back = signals.imu.times_ns, np.linalg.inv(camera.axes)
-    as_recorded = turns.GyroTurns(times_ns, as_exchanged.rate_at(times_ns) @ back.T)
-    fits = [inertial.fit_accel_axes(times_ns, accel, g) for g in (as_recorded, as_exchanged)]
+    # turned or mirrored along with the gyroscope, as drivers do that have left-handed axes, or not
+    gyro, times_ns = camera.gyro.shifted(-camera.bias), signals.imu.times_ns
+    fits = [inertial.fit_accel_axes(times_ns, a, gyro) for a in (accel @ camera.axes.T, accel)]
     if fits[0] is None or fits[1] is None:
         return None
     spread, exchanged = fits[0].as_is, fits[1].as_is
-    if max(spread, exchanged) < _DISAGREE * min(spread, exchanged):
+    if max(spread, exchanged) < _UNLIKE * min(spread, exchanged):
         return None
     return spread < exchanged
 

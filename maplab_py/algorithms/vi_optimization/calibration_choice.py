@@ -26,7 +26,7 @@ _CONVERGED = ("cost has converged", "no more decrease is expected", "step is sma
 _MIN_OBSERVATIONS = 3000
 _DIRECT = "multifrontal"
 _STRONG_GAIN, _STRONG_SHARE = 3.0, 0.5
-"""A gain of so many times the least makes do with this share of the least change: no true calibration has it."""
+"""No true calibration gains so many times the least: it is freed from this share of the least change on."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -355,7 +355,8 @@ class FixedLagSmoother:
 
     def _remove(self, observations: I64) -> None:
         if len(observations):
-            is_removed = np.isin(np.arange(len(self.tracks.observations)), observations)
+            is_removed: Mask = np.zeros(len(self.tracks.observations), dtype=np.bool_)
+            is_removed[observations] = True
             self.tracks.remove_observations(is_removed, self._poses())
 
     # -- what a localised smoother adds -----------------------------------------------------------

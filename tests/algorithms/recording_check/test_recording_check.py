@@ -370,6 +370,18 @@ def test_units_axes_clock_and_mounting_are_mended_together() -> None:
     assert np.degrees(off.max()) < 1.0
     assert "accelerations times 9.81, rates times 0.0174533, axes (y, x, z)" in read.notes[-1]
     assert "time offset 20" in read.notes[-1]
+    # the clock is the rig's: images taken together stay together
+    assert len({camera.time_offset_ns for camera in read.device.cameras}) == 1
+
+
+def test_left_handed_axes_of_the_whole_imu_are_mended() -> None:
+    axes = faults.AXES["flip z"]
+    wrong = faults.with_imu(mission(), axes, axes)
+    read = mended(wrong, diagnose(wrong), STREAM)
+    assert read is not None
+    assert first_cause(diagnose(read)) is None
+    np.testing.assert_allclose(read.accel, axes)
+    np.testing.assert_allclose(read.gyro, axes)
 
 
 def test_a_sound_recording_and_a_hopeless_one_stay() -> None:
