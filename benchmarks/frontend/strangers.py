@@ -219,21 +219,6 @@ def _merged_stamps(recording: Recording) -> Recording:
 
 
 @dataclasses.dataclass(frozen=True)
-class Run:
-    """Outcome of one run."""
-
-    start_s: float = np.inf  # infinite = it has not started
-    covered: float = 0.0  # share of the recording with vertices
-    ate_m: float = np.nan  # of the map, each mission aligned
-    optimised_m: float = np.nan  # after optvi --ba_calibration=auto
-    path_m: float = 0.0
-    missions: int = 0
-    error_px: float = np.nan  # median over the frames of the window's median reprojection error
-    calibration: CalibrationErrors | None = None  # of the map
-    says: tuple[str, ...] = ()
-
-
-@dataclasses.dataclass(frozen=True)
 class CalibrationErrors:
     """Largest errors of the calibration of a map over its cameras."""
 
@@ -251,6 +236,21 @@ class CalibrationErrors:
             f"{self.rotation_deg:.2f} deg, {self.position_mm:.1f} mm, offset {self.offset_ms:.2f} ms, rows "
             f"{self.line_delay_ms:.2f} ms, focal {self.focal_percent:.2f} %, centre {self.centre_px:.2f} px"
         )
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """Outcome of one run."""
+
+    start_s: float = np.inf  # infinite = it has not started
+    covered: float = 0.0  # share of the recording with vertices
+    ate_m: float = np.nan  # of the map, each mission aligned
+    optimised_m: float = np.nan  # after optvi --ba_calibration=auto
+    path_m: float = 0.0
+    missions: int = 0
+    error_px: float = np.nan  # median over the frames of the window's median reprojection error
+    calibration: CalibrationErrors | None = None  # of the map
+    says: tuple[str, ...] = ()
 
 
 def calibration_errors(vi_map: VIMap, sound: RecordedSensors, taken_ns: I64) -> CalibrationErrors:

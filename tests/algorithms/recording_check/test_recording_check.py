@@ -377,9 +377,9 @@ def test_units_axes_clock_and_mounting_are_mended_together() -> None:
 def test_left_handed_axes_of_the_whole_imu_are_mended() -> None:
     axes = faults.AXES["flip z"]
     wrong = faults.with_imu(mission(), axes, axes)
-    read = mended(wrong, diagnose(wrong), STREAM)
+    read = mended(wrong, doctor.diagnose(wrong), STREAM)
     assert read is not None
-    assert first_cause(diagnose(read)) is None
+    assert doctor.first_cause(doctor.diagnose(read)) is None
     np.testing.assert_allclose(read.accel, axes)
     np.testing.assert_allclose(read.gyro, axes)
 
