@@ -185,8 +185,10 @@ def optimised(room: StereoRoom) -> VIMap:
     return vi_map.replace(baseframes=vi_map.baseframes.replace(T_G_M=T_G_M))
 
 
-def measure(room: StereoRoom, *, with_optimised: bool = False) -> dict[str, Any]:
-    """Return all figures."""
+def measure(
+    room: StereoRoom, *, with_optimised: bool = False, unchecked: bool = False
+) -> dict[str, Any]:
+    """Return the figures, if asked also those of depth that neighbours have not checked."""
     truth = room.true_map
     true_depth, _ = import_depth_maps(truth, 0, 0, room.depth())
     surface = seen_surface(true_depth)
@@ -195,7 +197,8 @@ def measure(room: StereoRoom, *, with_optimised: bool = False) -> dict[str, Any]
     results: dict[str, Any] = {"mesh of true depth": mesh_errors(room, mesh.p, surface)}
     links = ImageImportOptions(link=True)
     images, _ = import_images(truth, 0, room.recording, links)
-    for name, checked in (("without neighbours", False), ("stereo", True)):
+    kinds = {"without neighbours": False} if unchecked else {}
+    for name, checked in (kinds | {"stereo": True}).items():
         cpu = time.process_time()
         settings = StereoSettings(StereoOptions(multi_view=checked))
         stereo, report = reconstruct_stereo(images, Path(), None, settings)
@@ -227,7 +230,7 @@ def main() -> None:
             room = StereoRoom(folder)
         else:
             room = StereoRoom.simulated(folder, load_scenario("stereo_room"))
-        results = measure(room, with_optimised=arguments.optimised)
+        results = measure(room, with_optimised=arguments.optimised, unchecked=True)
     print(json.dumps(results, indent=2, default=dataclasses.asdict))
 
 

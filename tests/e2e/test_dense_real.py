@@ -18,7 +18,7 @@ _MIN_OBSERVERS = 4
 def test_depth_agrees_with_triangulated_landmarks(tmp_path: Path) -> None:
     recording = shared_data("euroc_mh01_10s")
     with Session() as session:
-        session.run("rovioli", datasource_folder=recording)
+        session.run("rovioli", datasource_folder=recording, vio_rosbag_end_s=6)
         for command in ("optvi", "rtl", "elq"):
             session.run(command)
         session.run("import_images", dataset_folder=recording, link=True)

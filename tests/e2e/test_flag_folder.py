@@ -17,7 +17,7 @@ from maplab_py.simulation.scenario import Scenario
 from maplab_py.storage.native import save_map
 from maplab_py.vimap.tables import LandmarkQuality
 from tests.e2e.support import run_program
-from tests.registry.workspace import ROUND, make_workspace
+from tests.registry.workspace import ROUND
 from tests.simulation.small import SMALL, simulated
 from tests.support.data import REPOSITORY, shared_data
 
@@ -85,13 +85,13 @@ def simulated_maps(folder: Path, scenario: Scenario = SMALL) -> None:
 
 @pytest.mark.slow
 def test_localization_map(tmp_path: Path) -> None:
-    make_workspace(tmp_path)
-    places = ["--maps_folder=maps/v1_01", "--map_folder=small"]
+    simulated_maps(tmp_path / "maps", ROUND)
+    places = ["--maps_folder=maps/walk_0", "--map_folder=small"]
     script = str(FLAGS / "localization_map.maplab")
     done = run_program(tmp_path, "--json", "run", script, *places, seconds=300)
     assert done.returncode == 0, done.stderr
     with Session() as session:
-        session.run("load", map_folder=tmp_path / "maps" / "v1_01")
+        session.run("load", map_folder=tmp_path / "maps" / "walk_0")
         before = session.vi_map
         session.run("load", map_folder=tmp_path / "small")
         after = session.vi_map
@@ -101,9 +101,9 @@ def test_localization_map(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_calibration(tmp_path: Path) -> None:
-    make_workspace(tmp_path)
+    simulated_maps(tmp_path / "maps", ROUND)
     # a short walk shows no accelerometer scale
-    words = ["--maps_folder=maps/v1_01", "--map_folder=calibrated", "--sc_states=intrinsics"]
+    words = ["--maps_folder=maps/walk_0", "--map_folder=calibrated", "--sc_states=intrinsics"]
     script = str(FLAGS / "calibration.maplab")
     done = run_program(tmp_path, "--json", "run", script, *words, seconds=300)
     assert done.returncode == 0, done.stderr

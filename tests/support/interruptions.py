@@ -19,7 +19,7 @@ from tests.support.data import REPOSITORY
 from tests.support.programs import module_program
 
 CTRL_C = "\x03"
-SHARES = (0.1, 0.3, 0.5, 0.7, 0.9)
+SHARES = (0.3, 0.5, 0.7, 0.9)
 """Of a command's run time, when Ctrl-C is pressed."""
 OTHER_LINES = {
     "self_calibrate": (
@@ -152,19 +152,22 @@ class Interrupter:
                 return found.group(1)
         raise AssertionError(printed)
 
-    def interrupt(self, name: str, *, at_most_s: float) -> list[Press]:
+    def interrupt(
+        self, name: str, *, at_most_s: float, shares: tuple[float, ...] = SHARES
+    ) -> list[Press]:
         """Interrupt the example of a command at several moments.
 
         Args:
             name: The command.
             at_most_s: Longer commands are taken for as long as this.
+            shares: Of its run time, when Ctrl-C is pressed.
         """
         example = OTHER_LINES.get(name, ("", self._registry.find(name).example))[1]
         self._prepare(name)
         presses = [self._press(name, example, 0.15)]  # also while it imports what it needs
         time_s = self._time_of(example, at_most_s)
         self._prepare(name)
-        presses += [self._press(name, example, share * time_s) for share in SHARES[1:]]
+        presses += [self._press(name, example, share * time_s) for share in shares]
         return presses
 
     def _prepare(self, name: str) -> None:

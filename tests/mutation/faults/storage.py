@@ -55,7 +55,7 @@ STORAGE = (
     Fault(
         "checksums_not_verified",
         "maplab_py/storage/map_loading.py",
-        "    files = listed_files(folder, budget.max_bytes)\n    verify(folder, listed)\n",
+        "    files = listed_files(folder, budget.max_bytes)\n    checksums.verify(folder, listed)\n",
         "    files = listed_files(folder, budget.max_bytes)\n",
         _MAPS,
     ),
