@@ -1,19 +1,14 @@
 """Commands that measure the accuracy of a map."""
 
-from __future__ import annotations
-
 import dataclasses
 import weakref
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from maplab_py.algorithms.evaluation import reports
 from maplab_py.algorithms.evaluation.options import TrajectoryEvaluationOptions
 from maplab_py.console.session.session import MEASURED
 from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, UserError, command
-
-if TYPE_CHECKING:
-    from maplab_py.vimap import VIMap
+from maplab_py.vimap import VIMap
 
 
 @command(

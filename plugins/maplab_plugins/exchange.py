@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from maplab_py.algorithms.external_poses.options import GpsOptions, TrajectoryOptions, WheelOptions
+from maplab_py.algorithms.external_poses import options as poses
 from maplab_py.interop.device import DeviceOptions
 from maplab_py.plugin import (
     ALL_MISSIONS,
@@ -19,13 +19,12 @@ from maplab_py.plugin import (
 )
 
 if TYPE_CHECKING:
-    from maplab_py.algorithms.external_poses.options import GpsImport, TrajectoryImport, WheelImport
     from maplab_py.algorithms.self_calibration.reports import ComparedParameter
     from maplab_py.interop.calibration_import import CalibrationFile
     from maplab_py.interop.trajectories import Trajectory
     from maplab_py.sensors import Imu
 
-_TRAJECTORY, _GPS, _WHEELS = TrajectoryOptions(), GpsOptions(), WheelOptions()
+_TRAJECTORY, _GPS, _WHEELS = poses.TrajectoryOptions(), poses.GpsOptions(), poses.WheelOptions()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -229,10 +228,10 @@ def import_trajectory(
     context: CommandContext,
     trajectory_file: Path,
     *,
-    options: TrajectoryOptions = _TRAJECTORY,
+    options: poses.TrajectoryOptions = _TRAJECTORY,
     map_mission: str = "",
     map_key: str = "",
-) -> TrajectoryImport:
+) -> poses.TrajectoryImport:
     """Read a trajectory as absolute poses or odometry edges of a mission, or as a new mission.
 
     TUM, EuRoC and CSV with named columns are told apart by their content; KITTI needs --times_file.
@@ -260,9 +259,8 @@ def import_trajectory(
 
 
 def _measurements(
-    context: CommandContext, trajectory: Trajectory, options: TrajectoryOptions, mission: int
-) -> TrajectoryImport:
-    from maplab_py.algorithms.external_poses.options import TrajectoryImport
+    context: CommandContext, trajectory: Trajectory, options: poses.TrajectoryOptions, mission: int
+) -> poses.TrajectoryImport:
     from maplab_py.algorithms.external_poses.trajectories import (
         as_absolute_poses,
         as_odometry,
@@ -283,7 +281,7 @@ def _measurements(
         added = count - 1 - missing
     notes.append(clock_note(before, mission, trajectory, options))
     context.commit(after)
-    return TrajectoryImport(
+    return poses.TrajectoryImport(
         file=Path(trajectory.source),
         kind=options.kind,
         mission=mission_labels(before)[mission],
@@ -297,9 +295,8 @@ def _measurements(
 
 
 def _new_mission(
-    context: CommandContext, trajectory: Trajectory, options: TrajectoryOptions, map_key: str
-) -> TrajectoryImport:
-    from maplab_py.algorithms.external_poses.options import TrajectoryImport
+    context: CommandContext, trajectory: Trajectory, options: poses.TrajectoryOptions, map_key: str
+) -> poses.TrajectoryImport:
     from maplab_py.algorithms.external_poses.trajectories import as_mission
     from maplab_py.vimap.ids import to_hex
     from maplab_py.vimap.merge import merge_maps
@@ -309,7 +306,7 @@ def _new_mission(
         context.maps.add(map_key or Path(trajectory.source).stem, vi_map)
     else:
         context.commit(merge_maps(context.vi_map, vi_map)[0])
-    return TrajectoryImport(
+    return poses.TrajectoryImport(
         file=Path(trajectory.source),
         kind="mission",
         mission=to_hex(vi_map.missions.id[0])[:8],
@@ -329,8 +326,8 @@ def import_gps(
     gps_file: Path,
     *,
     map_mission: str = "",
-    options: GpsOptions = _GPS,
-) -> GpsImport:
+    options: poses.GpsOptions = _GPS,
+) -> poses.GpsImport:
     """Attach positions of a satellite receiver to the vertices of a mission.
 
     Positions become east, north and up of an origin, which the map keeps, and G becomes that frame: the
@@ -342,7 +339,6 @@ def import_gps(
         map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
     """
     from maplab_py.algorithms.external_poses.gps import attach_fixes
-    from maplab_py.algorithms.external_poses.options import GpsImport, LeftOutFixes
     from maplab_py.interop.gps import read_fixes
     from maplab_py.vimap.queries import mission_labels
 
@@ -350,12 +346,12 @@ def import_gps(
     track = read_fixes(gps_file, options.date, options.topic, options.time_unit)
     result = attach_fixes(context.vi_map, mission, track, options)
     context.commit(result.vi_map)
-    return GpsImport(
+    return poses.GpsImport(
         gps_file,
         mission_labels(result.vi_map)[mission],
         len(track),
         result.added,
-        tuple(LeftOutFixes(reason, count) for reason, count in track.left_out),
+        tuple(poses.LeftOutFixes(reason, count) for reason, count in track.left_out),
         *result.origin,
         *result.movement,
         result.median_error_m,
@@ -373,8 +369,8 @@ def import_wheel_odometry(
     wheel_file: Path,
     *,
     map_mission: str = "",
-    options: WheelOptions = _WHEELS,
-) -> WheelImport:
+    options: poses.WheelOptions = _WHEELS,
+) -> poses.WheelImport:
     """Join the vertices of a mission by wheel odometry.
 
     The file has poses, motions or velocities, told apart by the names of its columns. optvi can estimate
@@ -385,7 +381,6 @@ def import_wheel_odometry(
             with qx, qy, qz, qw and velocities with wx, wy, wz are of all six directions.
         map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
     """
-    from maplab_py.algorithms.external_poses.options import WheelImport
     from maplab_py.algorithms.external_poses.wheels import attach_wheels
     from maplab_py.interop.wheel_odometry import read_wheel_odometry
     from maplab_py.vimap.queries import mission_labels
@@ -396,7 +391,7 @@ def import_wheel_odometry(
         context.terminal.note(track.note)
     result = attach_wheels(context.vi_map, mission, track, options)
     context.commit(result.vi_map)
-    return WheelImport(
+    return poses.WheelImport(
         wheel_file,
         track.kind,
         mission_labels(result.vi_map)[mission],

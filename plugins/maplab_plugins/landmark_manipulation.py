@@ -1,29 +1,16 @@
 """Commands on landmarks: triangulate, evaluate, remove, and repair their observations."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
-from maplab_py.algorithms.landmarks.options import InvalidObservationOptions, LandmarkQualityOptions
+from maplab_py.algorithms.landmarks import options as landmarks
 from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, command
-
-if TYPE_CHECKING:
-    from maplab_py.algorithms.landmarks.options import (
-        InvalidObservationReport,
-        LandmarkQualityReport,
-        LandmarkRemovalReport,
-        RetriangulationReport,
-        TrackReport,
-    )
 
 
 @command("retriangulate_landmarks", "rtl", example="rtl --elq_min_observers=2")
 def retriangulate_landmarks(
     context: CommandContext,
     *,
-    options: LandmarkQualityOptions = LandmarkQualityOptions(),
+    options: landmarks.LandmarkQualityOptions = landmarks.LandmarkQualityOptions(),
     chosen: MissionChoice = ALL_MISSIONS,
-) -> RetriangulationReport:
+) -> landmarks.RetriangulationReport:
     """Triangulate all landmarks from their observations and evaluate their quality."""
     from maplab_py.algorithms.landmarks.triangulation import retriangulate
 
@@ -36,9 +23,9 @@ def retriangulate_landmarks(
 def init_track_landmarks(
     context: CommandContext,
     *,
-    options: LandmarkQualityOptions = LandmarkQualityOptions(),
+    options: landmarks.LandmarkQualityOptions = landmarks.LandmarkQualityOptions(),
     chosen: MissionChoice = ALL_MISSIONS,
-) -> TrackReport:
+) -> landmarks.TrackReport:
     """Create landmarks for feature tracks that have none, then triangulate all."""
     from maplab_py.algorithms.landmarks.tracks import init_tracks
 
@@ -51,9 +38,9 @@ def init_track_landmarks(
 def evaluate_landmark_quality(
     context: CommandContext,
     *,
-    options: LandmarkQualityOptions = LandmarkQualityOptions(),
+    options: landmarks.LandmarkQualityOptions = landmarks.LandmarkQualityOptions(),
     chosen: MissionChoice = ALL_MISSIONS,
-) -> LandmarkQualityReport:
+) -> landmarks.LandmarkQualityReport:
     """Classify every landmark as good or bad."""
     from maplab_py.algorithms.landmarks.quality import evaluate_quality
 
@@ -65,7 +52,7 @@ def evaluate_landmark_quality(
 @command("reset_landmark_quality", "rlq", example="rlq")
 def reset_landmark_quality(
     context: CommandContext, *, chosen: MissionChoice = ALL_MISSIONS
-) -> LandmarkQualityReport:
+) -> landmarks.LandmarkQualityReport:
     """Set the quality of all landmarks to unknown."""
     from maplab_py.algorithms.landmarks.quality import reset_quality
 
@@ -77,7 +64,7 @@ def reset_landmark_quality(
 @command("remove_bad_landmarks", "rbl", example="rbl")
 def remove_bad_landmarks(
     context: CommandContext, *, chosen: MissionChoice = ALL_MISSIONS
-) -> LandmarkRemovalReport:
+) -> landmarks.LandmarkRemovalReport:
     """Remove all landmarks of quality bad; their keypoints stay."""
     from maplab_py.algorithms.landmarks.removal import remove_bad
 
@@ -90,9 +77,9 @@ def remove_bad_landmarks(
 def remove_invalid_observations(
     context: CommandContext,
     *,
-    options: InvalidObservationOptions = InvalidObservationOptions(),
+    options: landmarks.InvalidObservationOptions = landmarks.InvalidObservationOptions(),
     chosen: MissionChoice = ALL_MISSIONS,
-) -> InvalidObservationReport:
+) -> landmarks.InvalidObservationReport:
     """Detach observations that contradict their landmark and create new landmarks from their tracks."""
     from maplab_py.algorithms.landmarks import removal
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.localization.options import LocalizationOptions
+from maplab_py.algorithms.localization.options import LocalizationOptions, LocalizationReport
 from maplab_py.algorithms.loop_closure.options import FeatureTypeOptions
 from maplab_py.input_files import SizeOptions
 from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, UserError, command
@@ -16,7 +16,6 @@ from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, UserEr
 if TYPE_CHECKING:
     from maplab_py.algorithms.localization.database import LocalizationMap
     from maplab_py.algorithms.localization.localization import Localizations, Reference
-    from maplab_py.algorithms.localization.options import LocalizationReport
     from maplab_py.console.session.session import Session
     from maplab_py.vimap import VIMap
 

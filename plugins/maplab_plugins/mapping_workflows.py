@@ -1,19 +1,13 @@
 """Whole workflows as one command."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from maplab_py.algorithms.keyframing.options import KeyframingOptions
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.sparsification.options import SparsificationOptions
-from maplab_py.algorithms.summary.options import SummaryMapOptions
+from maplab_py.algorithms.summary.options import SummaryMapOptions, WorkflowReport
 from maplab_py.plugin import CommandContext, UserError, command
-
-if TYPE_CHECKING:
-    from maplab_py.algorithms.summary.options import WorkflowReport
 
 
 @command(

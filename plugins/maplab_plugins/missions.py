@@ -1,21 +1,16 @@
 """Missions of the selected map: removal, and whether their base frames are known."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from maplab_py.algorithms.pose_graph_manipulation.layout import LayoutOptions
 from maplab_py.plugin import CommandContext, Message, UserError, command
 from maplab_py.report import counted
+from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import to_hex
 from maplab_py.vimap.queries import mission_distances_m, mission_labels, mission_time_spans_ns
-
-if TYPE_CHECKING:
-    from maplab_py.vimap import VIMap
 
 
 @command("remove_mission", "rm", example="remove_mission --map_mission=59f0 --yes")

@@ -26,9 +26,7 @@ def assign_edge_uncertainties(
         orientation_std_dev_degrees: Standard deviation of the orientation about each axis in
             degrees.
     """
-    from maplab_py.algorithms.pose_graph_manipulation.edges import assign_covariance
-
-    result, count = assign_covariance(
+    result, count = edges.assign_covariance(
         context.vi_map,
         edge_type,
         position_sigma_m=translation_std_dev_meters,
@@ -53,9 +51,7 @@ def assign_switch_variable_values(
     Args:
         lc_switch_variable_value: Value between 0 (the edge has no effect) and 1 (full effect).
     """
-    from maplab_py.algorithms.pose_graph_manipulation.edges import assign_switch_variables
-
-    result, count = assign_switch_variables(context.vi_map, value=lc_switch_variable_value)
+    result, count = edges.assign_switch_variables(context.vi_map, value=lc_switch_variable_value)
     context.commit(result)
     return Message(
         f"set the switch variable of {counted(count, 'loop closure edge')} to {lc_switch_variable_value:g}"
@@ -76,9 +72,9 @@ def assign_switch_variable_uncertainties(
     Args:
         lc_switch_variable_variance: Variance of the prior.
     """
-    from maplab_py.algorithms.pose_graph_manipulation.edges import assign_switch_variables
-
-    result, count = assign_switch_variables(context.vi_map, variance=lc_switch_variable_variance)
+    result, count = edges.assign_switch_variables(
+        context.vi_map, variance=lc_switch_variable_variance
+    )
     context.commit(result)
     return Message(
         f"set the switch variance of {counted(count, 'loop closure edge')} to {lc_switch_variable_variance:g}"
@@ -93,6 +89,4 @@ def artificially_disturb_vertices(
     chosen: MissionChoice = ALL_MISSIONS,
 ) -> layout.DisturbanceReport:
     """Disturb all vertices by a random walk, to test what corrects it."""
-    from maplab_py.algorithms.pose_graph_manipulation.layout import disturb_vertices
-
-    return context.apply(disturb_vertices, options, missions=chosen.rows(context.vi_map))
+    return context.apply(layout.disturb_vertices, options, missions=chosen.rows(context.vi_map))

@@ -1,15 +1,9 @@
 """Commands that turn images, depth maps and point clouds into resources of a map, and back."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from maplab_py.interop.resources import depth_maps, images
+from maplab_py.interop.resources import depth_maps, images, matching
 from maplab_py.plugin import CommandContext, command
-
-if TYPE_CHECKING:
-    from maplab_py.interop.resources.matching import ExportedImages, ImportedResources
 
 
 @command(
@@ -24,7 +18,7 @@ def import_images(
     *,
     map_mission: str = "",
     options: images.ImageImportOptions = images.ImageImportOptions(),
-) -> ImportedResources:
+) -> matching.ImportedResources:
     """Attach the images of an EuRoC or TUM-VI folder to the frames of a mission.
 
     The k-th camera of the mission gets the images of cam<k>. Image and frame belong together if each is
@@ -35,10 +29,12 @@ def import_images(
         dataset_folder: Folder with mav0/cam0 or cam0; its calibration is not read.
         map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
     """
-    from maplab_py.interop.resources.images import import_images as attach
-
     return context.apply(
-        attach, context.mission_row(map_mission), dataset_folder, options, progress=context.progress
+        images.import_images,
+        context.mission_row(map_mission),
+        dataset_folder,
+        options,
+        progress=context.progress,
     )
 
 
@@ -56,7 +52,7 @@ def export_images(
     map_mission: str = "",
     resource_type: str = "raw_images",
     overwrite: bool = False,
-) -> ExportedImages:
+) -> matching.ExportedImages:
     """Write the images of a mission as an EuRoC folder: mav0/cam0/data/<stamp>.png and data.csv.
 
     Args:
@@ -65,10 +61,9 @@ def export_images(
         resource_type: Number or name of the type of image or depth map.
         overwrite: Replace files that exist.
     """
-    from maplab_py.interop.resources.images import export_images as write
     from maplab_py.storage.resources.types import resource_type_of
 
-    return write(
+    return images.export_images(
         context.vi_map,
         context.map_folder or Path(),
         context.mission_row(map_mission),
@@ -92,7 +87,7 @@ def import_depth_maps(
     map_mission: str = "",
     camera: int = 0,
     options: depth_maps.DepthImportOptions = depth_maps.DepthImportOptions(),
-) -> ImportedResources:
+) -> matching.ImportedResources:
     """Attach depth images of another program to the frames of a camera, as raw depth maps.
 
     The files are 16-bit PNG images named <time stamp in ns>.png, of the size of the camera's images:
@@ -103,10 +98,8 @@ def import_depth_maps(
         map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
         camera: Index of the camera in its rig.
     """
-    from maplab_py.interop.resources.depth_maps import import_depth_maps as attach
-
     return context.apply(
-        attach,
+        depth_maps.import_depth_maps,
         context.mission_row(map_mission),
         camera,
         depth_folder,
@@ -127,7 +120,7 @@ def import_point_clouds(
     *,
     map_mission: str = "",
     sensor_id: str = "",
-) -> ImportedResources:
+) -> matching.ImportedResources:
     """Attach point clouds of another program to a sensor of a mission, each at its time.
 
     The files are PLY or PCD, named <time stamp in ns>.ply or .pcd, with points in the sensor's frame.

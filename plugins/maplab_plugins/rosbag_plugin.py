@@ -5,14 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from maplab_py.interop.bags.options import BagExportOptions, BagImportOptions, PoseToBagOptions
+from maplab_py.interop.bags import options as bags
 from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, UserError, command
 
 if TYPE_CHECKING:
     from maplab_py.interop.bags.listing import BagInfo
-    from maplab_py.interop.bags.options import BagImport, BagReport
 
-_POSES, _EXPORT, _IMPORT = PoseToBagOptions(), BagExportOptions(), BagImportOptions()
+_POSES, _EXPORT, _IMPORT = bags.PoseToBagOptions(), bags.BagExportOptions(), bags.BagImportOptions()
 
 
 @command(
@@ -26,10 +25,10 @@ def pose_to_bag(
     *,
     rosbag_plugin_input_bag: Path | None = None,
     rosbag_plugin_output_bag: Path | None = None,
-    options: PoseToBagOptions = _POSES,
+    options: bags.PoseToBagOptions = _POSES,
     chosen: MissionChoice = ALL_MISSIONS,
     overwrite: bool = False,
-) -> BagReport:
+) -> bags.BagReport:
     """Copy a bag and add the poses of the map: to /tf, and as T_G_I, T_M_I and T_G_M.
 
     The copy has the format of the input, and its messages are copied byte by byte. With several missions,
@@ -64,9 +63,9 @@ def export_bag(
     bag: Path,
     *,
     map_mission: str = "",
-    options: BagExportOptions = _EXPORT,
+    options: bags.BagExportOptions = _EXPORT,
     overwrite: bool = False,
-) -> BagReport:
+) -> bags.BagReport:
     """Write a mission as a ROS bag: poses, tf, IMU samples, images, depth maps, clouds.
 
     Images, depth maps and clouds are the resources of the map. Topics are those of the sensors, else /imu0,
@@ -103,7 +102,7 @@ def export_mcap(
     *,
     mcap_images: bool = True,
     overwrite: bool = False,
-) -> BagReport:
+) -> bags.BagReport:
     """Write the map for Foxglove and other viewers: paths, poses, landmarks, loop closures, images.
 
     The messages are those of ROS 2, in the frame map; landmarks, closures and paths are there from the
@@ -158,8 +157,8 @@ def import_bag_resources(
     rosbag_path: Path,
     *,
     map_mission: str = "",
-    options: BagImportOptions = _IMPORT,
-) -> BagImport:
+    options: bags.BagImportOptions = _IMPORT,
+) -> bags.BagImport:
     """Attach images, depth images or point clouds of a topic to frames or a sensor of a mission.
 
     Image and frame belong together if each is the nearest of the other in time. Frames that have an image

@@ -15,15 +15,6 @@ from maplab_py.server import options as server_options
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from maplab_py.server.options import (
-        DeletedMissions,
-        DenseMapReport,
-        LookupReport,
-        PlayedRobots,
-        PushReport,
-        ServeReport,
-        ServerStatus,
-    )
     from maplab_py.server.submap_sources import RecordedSession
     from maplab_py.vimap import VIMap
 
@@ -47,7 +38,7 @@ def serve(
     incremental: server_options.IncrementalOptions = server_options.IncrementalOptions(),
     service: server_options.ServiceOptions = server_options.ServiceOptions(),
     serve_visualize_map: bool = False,
-) -> ServeReport:
+) -> server_options.ServeReport:
     """Merge the submaps that robots put into a spool into one map, and publish it.
 
     Robots put map folders under incoming/ROBOT of the spool by one rename; `push` does it. Every
@@ -93,7 +84,7 @@ def push(
     spool: Path,
     robot_name: str = "robot",
     name: str = "",
-) -> PushReport:
+) -> server_options.PushReport:
     """Put a submap into the spool of a map server: copied, compared with its checksum, then renamed.
 
     Args:
@@ -103,10 +94,11 @@ def push(
         name: Name in the spool; empty = that of the folder.
     """
     from maplab_py.server import spool as spools
-    from maplab_py.server.options import PushReport
 
     with lasting_effect():
-        return PushReport(spools.push(spools.Spool(spool), robot_name, map_folder, name))
+        return server_options.PushReport(
+            spools.push(spools.Spool(spool), robot_name, map_folder, name)
+        )
 
 
 @command(
@@ -115,7 +107,9 @@ def push(
     needs_map=False,
     see_also=("serve", "serve_stop"),
 )
-def serve_status(context: CommandContext, *, spool: Path, wait_s: float = 0.0) -> ServerStatus:
+def serve_status(
+    context: CommandContext, *, spool: Path, wait_s: float = 0.0
+) -> server_options.ServerStatus:
     """Tell what a map server has done, and what lies in its spool; also where no server runs.
 
     Args:
@@ -123,7 +117,6 @@ def serve_status(context: CommandContext, *, spool: Path, wait_s: float = 0.0) -
         wait_s: Wait up to so long [s] until a server has merged all that can be merged.
     """
     from maplab_py.server.client import NotRunning, ask
-    from maplab_py.server.options import EventLine, RobotLine, ServerStatus
     from maplab_py.server.spool import Spool
     from maplab_py.server.status import status_without_server
 
@@ -134,11 +127,11 @@ def serve_status(context: CommandContext, *, spool: Path, wait_s: float = 0.0) -
         except NotRunning:
             status = status_without_server(folder)
         else:
-            robots = tuple(RobotLine(**line) for line in content.pop("robots"))
+            robots = tuple(server_options.RobotLine(**line) for line in content.pop("robots"))
             content["spool"] = Path(content["spool"])
-            events = (EventLine(**line) for line in content["last_events"])
+            events = (server_options.EventLine(**line) for line in content["last_events"])
             content["last_events"] = tuple(events)
-            status = ServerStatus(**content, robots=robots)
+            status = server_options.ServerStatus(**content, robots=robots)
         is_idle = status.is_running and not status.incoming + status.preparing + status.waiting
         if is_idle or time.monotonic() >= deadline:
             return status
@@ -183,7 +176,7 @@ def delete_mission(
     *,
     spool: Path,
     map_mission: str,
-) -> DeletedMissions:
+) -> server_options.DeletedMissions:
     """Remove a mission from the map of a server for good; its later submaps are refused.
 
     Args:
@@ -205,7 +198,7 @@ def delete_all_robot_missions(
     *,
     spool: Path,
     robot_name: str,
-) -> DeletedMissions:
+) -> server_options.DeletedMissions:
     """Remove all missions of a robot from the map of a server; submaps of new ones are accepted.
 
     Args:
@@ -229,7 +222,7 @@ def map_lookup(
     timestamp_ns: int,
     sensor: str = "",
     p_S: str = "0 0 0",
-) -> LookupReport:
+) -> server_options.LookupReport:
     """Ask a map server where a point that a robot's sensor saw is in the global frame.
 
     Args:
@@ -240,7 +233,6 @@ def map_lookup(
         p_S: Point in the frame of the sensor, "x y z" in metres.
     """
     from maplab_py.server.client import ask
-    from maplab_py.server.options import LookupReport
     from maplab_py.server.spool import Spool
 
     content = ask(
@@ -253,7 +245,7 @@ def map_lookup(
     )
     for name in ("p_G", "p_G_sensor"):
         content[name] = tuple(content[name])
-    return LookupReport(**content)
+    return server_options.LookupReport(**content)
 
 
 @command(
@@ -271,7 +263,7 @@ def get_dense_map_in_range(
     radius_m: float,
     output_file: Path | None = None,
     overwrite: bool = False,
-) -> DenseMapReport:
+) -> server_options.DenseMapReport:
     """Ask a map server for the dense points around a position.
 
     The server looks into resources of the type --maplab_server_dense_map_resource_type.
@@ -287,7 +279,6 @@ def get_dense_map_in_range(
 
     from maplab_py.interop.ply import PlyCloud, write_ply
     from maplab_py.server.client import ask
-    from maplab_py.server.options import DenseMapReport
     from maplab_py.server.spool import Spool
 
     given = {"center_G": center_G, "radius_m": repr(radius_m)}
@@ -295,7 +286,7 @@ def get_dense_map_in_range(
     points = np.array(content["p_G"], dtype=np.float64).reshape(-1, 3)
     if output_file is not None:
         write_ply(PlyCloud(points), output_file, overwrite=overwrite)
-    return DenseMapReport(len(points), int(content["resources"]), output_file)
+    return server_options.DenseMapReport(len(points), int(content["resources"]), output_file)
 
 
 @command(
@@ -314,7 +305,7 @@ def simulate_robots(
     seed: int | None = None,
     maps_folder: Path | None = None,
     play: server_options.PlayOptions = server_options.PlayOptions(),
-) -> PlayedRobots:
+) -> server_options.PlayedRobots:
     """Play robots: cut their sessions into submaps and put each into a spool when its time has come.
 
     The truth of simulated sessions goes to truth.npz of the spool, for `evaluate_map`.
@@ -326,7 +317,6 @@ def simulate_robots(
         maps_folder: Play the maps below this folder instead, as rovioli makes them of recordings; each
             mission is a robot, named after it or after the folder of its map.
     """
-    from maplab_py.server.options import PlayedRobots
     from maplab_py.server.spool import Spool
     from maplab_py.server.submap_sources import play as play_submaps
     from maplab_py.server.submap_sources import recorded_sessions, timed_submaps
@@ -340,7 +330,7 @@ def simulate_robots(
         sessions = _simulated_sessions(context, scenario, seed, folder.root / "truth.npz")
     submaps = timed_submaps(sessions, play.submap_s)
     seconds = play_submaps(submaps, folder, play.rate, context.progress)
-    return PlayedRobots(len(sessions), len(submaps), truth, seconds)
+    return server_options.PlayedRobots(len(sessions), len(submaps), truth, seconds)
 
 
 @command("tie_stationary_missions", see_also=("optimize_visual_inertial", "serve"))
@@ -375,13 +365,12 @@ def _shown(context: CommandContext) -> tuple[Callable[[VIMap], None], str]:
     return watch, viewer.url
 
 
-def _delete(spool: Path, name: str, **parameters: str) -> DeletedMissions:
+def _delete(spool: Path, name: str, **parameters: str) -> server_options.DeletedMissions:
     from maplab_py.server.client import order
-    from maplab_py.server.options import DeletedMissions
     from maplab_py.server.spool import Spool
 
     content = order(Spool(spool), name, **parameters)
-    return DeletedMissions(tuple(content["missions"]), content["vertices"])
+    return server_options.DeletedMissions(tuple(content["missions"]), content["vertices"])
 
 
 def _simulated_sessions(

@@ -6,20 +6,15 @@ import dataclasses
 import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from maplab_py.console.commands.lines import split_commands
+from maplab_py.console.commands.registry import Registry
 from maplab_py.console.session.maps import MapManager
+from maplab_py.console.terminal.protocol import Terminal
 from maplab_py.errors import MaplabError
 from maplab_py.plugin import CommandContext, Message, UserError, command
 from maplab_py.report import counted
-
-if TYPE_CHECKING:
-    from maplab_py.console.commands.registry import Registry
-    from maplab_py.console.session.maps import MapManager
-    from maplab_py.console.terminal.protocol import Terminal
-    from maplab_py.vimap import VIMap
-
+from maplab_py.vimap import VIMap
 
 _SCENARIO = "three_sessions"
 _WELCOME = (
