@@ -100,7 +100,7 @@ def rovioli(
     from maplab_py.frontend.finishing import finish
     from maplab_py.frontend.mapping import Mapping, load_kernels
 
-    _check_output(run.output)
+    _check_output(context, run.output)
     key = _new_key(context, map_key, folder := run.output.save_map_folder)
     is_shown, is_live = rovioli_visualize_map or keep_viewer, data.type in TRANSPORTS
     pictures = _pictures(context, key, map_publish_interval_s) if is_shown else None
@@ -209,8 +209,8 @@ def _run(
     return mapping
 
 
-def _check_output(output: OutputOptions) -> None:
-    """Refuse a map folder or files of poses that cannot be written.
+def _check_output(context: CommandContext, output: OutputOptions) -> None:
+    """Refuse a map folder or files of poses that cannot be written; say if a map is saved nowhere.
 
     Raises:
         UserError: One of them exists already, or its folder does not.
@@ -218,6 +218,10 @@ def _check_output(output: OutputOptions) -> None:
     from maplab_py.storage.native import check_parent, check_target
 
     folder = output.save_map_folder
+    if folder is None and output.run_map_builder and not context.terminal.is_prompt:
+        context.terminal.note(
+            "the map stays in memory: --save_map_folder=FOLDER, or save, keeps it"
+        )
     if folder is not None:
         check_target(folder, overwrite=output.overwrite_existing_map, flag="overwrite_existing_map")
         check_parent(folder)
