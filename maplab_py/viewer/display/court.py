@@ -23,6 +23,7 @@ from maplab_py.errors import MapError
 from maplab_py.viewer.display import panel
 from maplab_py.viewer.display.camera import approach
 from maplab_py.viewer.display.parts import by_user
+from maplab_py.viewer.display.selection import Selection
 from maplab_py.viewer.drawing import Drawing
 from maplab_py.viewer.facts import gate_facts
 from maplab_py.viewer.layers.closures import closure_ends
@@ -64,6 +65,10 @@ class Bench(Protocol):
     def drawing(self) -> Drawing:
         """The map as it is drawn."""
 
+    @property
+    def selection(self) -> Selection:
+        """Picked entities."""
+
     def select(self, picked: Pick) -> None:
         """Mark a thing and show its facts."""
 
@@ -89,6 +94,7 @@ class Court:
             "Closure court", order=0.5, visible=False, expand_by_default=False
         )
         with self._folder:
+            self.image = gui.add_image(np.zeros((8, 8, 3), dtype=np.uint8), visible=False)
             self.text = gui.add_html("")
             for label, key, verdict, colour, hint in _BUTTONS:
                 button = gui.add_button(label, color=colour, hint=f"{hint} (key {key})")
@@ -103,6 +109,7 @@ class Court:
         self._map, self._cases, self._place = vi_map, cases_of(vi_map), -1
         if self._folder.visible != bool(len(self._cases)):
             self._folder.visible = bool(len(self._cases))
+        self._show_images()
         self._say()
 
     def take_verdicts(self) -> dict[str, bool]:
@@ -127,11 +134,20 @@ class Court:
         ends = np.concatenate(closure_ends(drawing, closures.take(np.array([row]))))
         p = drawing.p_vertices[ends]
         self._bench.select(Pick(Entity.CLOSURE, row, p.mean(axis=0), 0.0))
+        self._show_images()
         if event.client is not None:
             distance_m = 1.5 * float(np.linalg.norm(p[1] - p[0])) + 0.4 * drawing.extent.radius_m
             with event.client.atomic():
                 approach(event.client.camera, p.mean(axis=0), distance_m)
         self._say()
+
+    def _show_images(self) -> None:
+        """Show both images of the open case with lines between what they have in common."""
+        picture = self._bench.selection.picture if self._place >= 0 else None
+        if picture is not None:
+            self.image.image = picture
+        if self.image.visible != (picture is not None):
+            self.image.visible = picture is not None
 
     def _say(self, note: str = "") -> None:
         """Write which case is open, and what was decided."""

@@ -46,6 +46,7 @@ class Selection:
         self.is_measuring = False
         self.picked: Pick | None = None
         self.distance_m: float | None = None
+        self.picture: U8 | None = None  # of the pick: an image, or both images of a closure
         self.on_pick: Callable[[str], None] = lambda _: None  # told the id of each pick
 
     def pick(self, drawing: Drawing, picked: Pick) -> None:
@@ -71,6 +72,7 @@ class Selection:
         elif self._ends and isinstance(drawing.images, VertexImages):
             pair = closure_picture(drawing.vi_map, drawing.images, *self._ends)
             image, note = pair or (None, note)
+        self.picture = image
         self._panel.show_facts(facts(drawing.vi_map, picked.entity, picked.row), image, note)
 
     def jump(self, drawing: Drawing, text: str, clients: list[Any]) -> None:

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.array_types import F64, I32
+from maplab_py.array_types import F64, I32, U8
 from maplab_py.viewer import colours
 from maplab_py.viewer.drawing import (
     PATH_ENDS,
@@ -44,13 +44,10 @@ def _paths_by_time(drawing: Drawing) -> Layer:
     vi_map, p = drawing.vi_map, drawing.p_vertices
     mission = vi_map.vertices.mission
     start = np.flatnonzero(mission[1:] == mission[:-1])
-    begin_ns = vi_map.vertices.timestamp_ns[vi_map.vertex_start[mission[start]]]
-    seconds = np.asarray(1e-9 * (vi_map.vertices.timestamp_ns[start] - begin_ns), dtype=np.float64)
-    part, low, high = colours.normalised(seconds)
-    colour = colours.ramp(part, colours.SEQUENTIAL)
+    colour, low, high = _time_colours(drawing)
     parts: dict[str, Part] = {
         mission_id: make_segments(
-            p[start[members]], p[start[members] + 1], colour[members], start[members], 3.0
+            p[start[members]], p[start[members] + 1], colour[start[members]], start[members], 3.0
         )
         for mission_id, members in drawing.by_mission(mission[start])
     }
@@ -59,14 +56,23 @@ def _paths_by_time(drawing: Drawing) -> Layer:
     return Layer("trajectories", "Trajectories", parts, len(vi_map.missions), legend=(legend,))
 
 
+def _time_colours(drawing: Drawing) -> tuple[U8, float, float]:
+    """Return a colour (V, 3) for each vertex by the time since its mission began, and the range [s]."""
+    table, start = drawing.vi_map.vertices, drawing.vi_map.vertex_start
+    since_ns = table.timestamp_ns - table.timestamp_ns[start[table.mission]]
+    part, low, high = colours.normalised(np.asarray(1e-9 * since_ns, dtype=np.float64))
+    return colours.ramp(part, colours.SEQUENTIAL), low, high
+
+
 def vertices(drawing: Drawing) -> Layer:
-    """A dot for each vertex."""
+    """A dot for each vertex, in the colour of the path."""
     mission = drawing.vi_map.vertices.mission
+    is_by_time = drawing.options.color_paths_by_time
+    colour = _time_colours(drawing)[0] if is_by_time else drawing.mission_colours[mission]
     parts: dict[str, Part] = {}
     for mission_id, rows in drawing.by_mission(mission):
-        colour = drawing.mission_colours[mission[rows[0]]]
         parts[mission_id] = make_points(
-            drawing.p_vertices[rows], colour, rows, 0.0045 * drawing.unit_m
+            drawing.p_vertices[rows], colour[rows], rows, 0.0045 * drawing.unit_m
         )
     return Layer("vertices", "Vertices", parts, len(mission), Entity.VERTEX)
 
