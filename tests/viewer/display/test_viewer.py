@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gzip
 import socket
 import threading
@@ -407,6 +408,27 @@ def test_pages_may_come_and_go(viewer: Viewer, two_missions: VIMap) -> None:
     assert viewer.wait(10.0)
     with connect(url, subprotocols=[protocol]) as connection:
         assert connection.recv(timeout=5.0)
+
+
+def test_ten_pages_and_one_that_comes_back_show_the_map_of_now(viewer: Viewer) -> None:
+    other = walk_map(vertices=20, seed=7)
+    with contextlib.ExitStack() as stack:
+        pages = [stack.enter_context(open_page(viewer)) for _ in range(10)]
+        for page in pages:
+            read_until(page, is_replayed)
+        pages[0].close()  # its machine sleeps
+        viewer.set_step(100)
+        viewer.set_playing(True)
+        viewer.follow(Subject(other, "other"))  # while it plays
+        assert viewer.wait(20.0)
+        assert viewer.player is None
+        assert not viewer.playback.time_line.is_playing
+        for page in pages[1:]:
+            read_until(page, lambda m: "20 vertices" in str(m.get("updates", "")))
+        back = page_state(viewer)
+    mission = to_hex(other.missions.id[0])
+    assert {key for layer, key in back.drawn if layer == "trajectories"} == {mission}
+    assert back.steps() == set()
 
 
 def test_another_map_begins_with_its_own_layers(viewer: Viewer) -> None:
