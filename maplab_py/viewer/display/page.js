@@ -443,7 +443,8 @@ const drawBy = (make) => {
   setInterval(() => {
     if (!canvas) return;
     const nodes = window.__viserMutable.nodeRefFromName;
-    const isWanted = Object.keys(nodes).some((name) => name.startsWith(OTHER) && nodes[name]);
+    const isPart = (name) => name.startsWith(OTHER) && name.split("/").length > 3; // groups of none stay
+    const isWanted = Object.keys(nodes).some((name) => isPart(name) && nodes[name]);
     if (isWanted !== Boolean(line)) (isWanted ? show : hide)();
   }, 200);
 })();

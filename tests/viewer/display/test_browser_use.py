@@ -194,32 +194,37 @@ class _OfSystem:
 
 
 def test_another_state_is_left_of_the_swipe_line(browser: Any) -> None:
+    """The path is wide and blue, the landmarks are grey; first the other path is shown, then the map's."""
     viewer = Viewer(0)
-    red, blue = np.array([200, 40, 40]), np.array([40, 40, 200])
-    viewer.show(
-        SUBJECT.replace(other=MAP.replace(), arrangement="swipe", only_layers=("vertices",))
+    viewer.set_ground(False)  # an axis of it is blue, too
+    subject = SUBJECT.replace(
+        options=SUBJECT.options.with_colouring("grey"), other=MAP.replace(), arrangement="swipe"
     )
+    viewer.show(subject.replace(only_layers=("swiped_trajectories", "landmarks")))
     page = Page(browser, viewer.url)
     line = page.page.locator(".maplab-swipe")
     assert page.wait_until(lambda: line.count() == 1)
-    viewer.server.scene.add_icosphere("/map/swiped_ball", radius=50.0, color=tuple(red.tolist()))
-    viewer.server.scene.add_icosphere("/map/ball", radius=50.0, color=tuple(blue.tolist()))
 
-    def parts() -> tuple[bool, bool]:
-        picture = page.picture().astype(int)
-        cut = round(line.bounding_box()["x"] + 15)
-        left, right = picture[200:, 5 : cut - 20], picture[200:, cut + 20 : -5]
-        redder = [np.median(side[:, :, 0] - side[:, :, 2]) for side in (left, right)]
-        return redder[0] > 20, redder[1] < -20
+    def has_path() -> tuple[bool, bool]:
+        picture, cut = page.picture(), round(line.bounding_box()["x"] + 15)
+        sides = picture[:, : cut - 20], picture[:, cut + 20 :]
+        left, right = (colour_count(side, colours.MISSIONS[0]) > 30 for side in sides)
+        return left, right
 
-    assert page.wait_until(lambda: parts() == (True, True))
-    box = line.bounding_box()
-    page.page.mouse.move(box["x"] + 15, 300)
-    page.page.mouse.down()
-    page.page.mouse.move(250, 300, steps=2)
-    page.page.mouse.up()
-    assert page.wait_until(lambda: abs(line.bounding_box()["x"] + 15 - 250) < 2)
-    assert page.wait_until(lambda: parts() == (True, True))
+    def move_line(x: float) -> None:
+        page.page.mouse.move(line.bounding_box()["x"] + 15, 300)
+        page.page.mouse.down()
+        page.page.mouse.move(x, 300, steps=2)
+        page.page.mouse.up()
+        assert page.wait_until(lambda: abs(line.bounding_box()["x"] + 15 - x) < 2)
+
+    move_line(350)
+    assert page.wait_until(lambda: has_path() == (True, False))
+    viewer.set_layers({"trajectories", "swiped_landmarks"})
+    assert page.wait_until(lambda: has_path() == (False, True))
+    move_line(40)
+    viewer.set_layers({"swiped_trajectories"})
+    assert page.wait_until(lambda: has_path() == (False, False))
     viewer.show(SUBJECT)
     assert page.wait_until(lambda: line.count() == 0)
     assert page.errors == []
