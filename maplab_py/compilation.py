@@ -1,8 +1,8 @@
 """The decorator that compiles kernels with numba and keeps their machine code; `prange`, `numba`.
 
-This is the only module that imports numba: before, it fixes the processor that numba compiles for,
-so that kernels give the same bits on all processors that can run them. `MAPLAB_NATIVE=1` compiles for
-this processor; NUMBA_CPU_NAME names any other.
+Only this module imports numba, and `numba_changes` for it: before, it fixes the processor that numba compiles
+for, so that kernels give the same bits on all processors that can run them. `MAPLAB_NATIVE=1` compiles
+for this processor; NUMBA_CPU_NAME names any other.
 
 Machine code is found by content. Its folder is named by what compiled it, its file by a hash of the
 types of the arguments and of all that decides what numba makes of the function: the instructions of the
@@ -23,7 +23,6 @@ import platform
 import sys
 from collections.abc import Callable, Iterator, Set
 from functools import cache
-from operator import attrgetter
 from pathlib import Path
 from types import CodeType, ModuleType
 from typing import Any
@@ -77,12 +76,16 @@ from numba.core.registry import CPUDispatcher  # noqa: E402
 from numba.core.sigutils import normalize_signature  # noqa: E402
 from numba.core.targetconfig import ConfigStack  # noqa: E402
 
+from maplab_py import numba_changes  # noqa: E402
+
 __all__ = ["TARGET", "compiled", "numba", "prange", "target_processor"]
 
 prange: Any = numba.prange
+_types: Any = numba.types
 
+_CHANGES = hashlib.sha256(Path(numba_changes.__file__).read_bytes()).hexdigest()[:8]
 TARGET = (
-    f"code-{sys.implementation.cache_tag}-numba-{numba.__version__}"
+    f"code-{sys.implementation.cache_tag}-numba-{numba.__version__}.{_CHANGES}"
     f"-numpy-{'.'.join(np.__version__.split('.')[:2])}-{os.environ.get('NUMBA_CPU_NAME', 'native')}"
 )
 """Folder of machine code in the package and in the user's cache."""
@@ -121,9 +124,9 @@ class _Kernel(CPUDispatcher):  # type: ignore[misc]
 
     def compile(self, sig: Any) -> Any:
         """Compile for the types of arguments, again if only kernels could call the function."""
-        types = tuple(normalize_signature(sig)[0])
-        if not _is_inside() and types not in self._with_wrapper:
-            self.overloads.pop(types, None)
+        arguments = tuple(normalize_signature(sig)[0])
+        if not _is_inside() and arguments not in self._with_wrapper:
+            self.overloads.pop(arguments, None)
         if _is_inside():
             return super().compile(sig)
         with kernel_cache.compilation():
@@ -132,17 +135,17 @@ class _Kernel(CPUDispatcher):  # type: ignore[misc]
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """Take numbers in the code of the caller for any numbers, so that one function serves all."""
         try:
-            return super().get_call_template(tuple(map(numba.types.unliteral, args)), kws)
+            return super().get_call_template(tuple(map(_types.unliteral, args)), kws)
         except numba.core.errors.TypingError:  # e.g. an index of a tuple
             return super().get_call_template(args, kws)
 
     def add_overload(self, cres: Any) -> None:
         """Let Python find what has a wrapper."""
-        types = tuple(cres.signature.args)
+        arguments = tuple(cres.signature.args)
         if _is_inside():
-            self.overloads[types] = cres
+            self.overloads[arguments] = cres
         else:
-            self._with_wrapper.add(types)
+            self._with_wrapper.add(arguments)
             super().add_overload(cres)
 
 
@@ -157,44 +160,7 @@ def _leave_out_wrappers(flags: Any) -> Any:
     return flags
 
 
-def _remember_types() -> None:
-    """Let numba resolve the type of `a + b` or `a[i]` once for each set of types, not at each place.
-
-    It is a third of the time that numba needs for a function. Flags are a part of what is remembered, since
-    functions of numba itself are compiled with some of those of their caller; the others do not count,
-    and none of these functions is called through a pointer.
-    """
-    function, flags_type = numba.types.Function, numba.core.compiler.Flags
-    resolve = function.get_call_type
-    inherited = attrgetter("nrt", "fastmath", "error_model", "forceinline")
-
-    def get_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
-        known = self.__dict__.setdefault("_known_calls", {})
-        flags = ConfigStack.top_or_none()
-        key = (context, tuple(args), flags and flags.copy())
-        if kws or key not in known:
-            signature = resolve(self, context, args, kws)
-            if kws or signature is None or not all(each.is_precise() for each in args):
-                return signature
-            known[key] = signature, self._impl_keys[signature.args]
-        signature, implementation = known[key]
-        self._impl_keys[signature.args] = implementation
-        return signature
-
-    def equal(self: Any, other: Any) -> bool:
-        return isinstance(other, flags_type) and inherited(self) == inherited(other)
-
-    def customize_flags(self: Any, flags: Any) -> Any:
-        flags.no_cfunc_wrapper |= self.py_func.__module__.startswith("numba.")
-        return flags
-
-    function.get_call_type = get_call_type
-    flags_type.__eq__ = equal
-    flags_type.__hash__ = lambda _: hash(flags_type)
-    numba.core.dispatcher._FunctionCompiler._customize_flags = customize_flags
-
-
-_remember_types()
+numba_changes.change_compiler()
 
 
 class _KernelCache(FunctionCache):  # type: ignore[misc]
@@ -250,9 +216,9 @@ def _packaged_folder(target: str) -> Path:
     return PACKAGED / target
 
 
-def _fields(types: Any) -> str:
+def _fields(kinds: Any) -> str:
     """Return the names of the fields of named tuples, which their types do not tell."""
-    tuples = [each for each in types if isinstance(each, numba.types.BaseTuple)]
+    tuples = [each for each in kinds if isinstance(each, _types.BaseTuple)]
     return repr([(getattr(each, "fields", ()), _fields(each.types)) for each in tuples])
 
 
@@ -298,6 +264,6 @@ def _describe(value: Any) -> str:
     if isinstance(value, type):
         members = list(value) if issubclass(value, enum.Enum) else getattr(value, "_fields", "")
         return f"{value.__qualname__} {members}"
-    if isinstance(value, numba.types.ExternalFunction):
+    if isinstance(value, _types.ExternalFunction):
         return f"{value.symbol} {value.sig}"
     return ""

@@ -39,7 +39,7 @@ HEAVY = (
 
 HOMES = {
     "casadi": ("estimation",),
-    "numba": ("compilation.py",),
+    "numba": ("compilation.py", "numba_changes.py"),
     "pycolmap": ("interop",),
     "trimesh": ("interop",),
     "viser": ("viewer",),
