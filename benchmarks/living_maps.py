@@ -40,8 +40,8 @@ from maplab_py.vimap.vertex_removal import remove_vertices
 
 BUDGET_SESSIONS = 3
 NEAR_M = 0.5
-QUERY_EVERY = 3
-"""Every third image of a session is a query."""
+QUERY_EVERY = 5
+"""Every fifth image of a session is a query."""
 BINS = 10
 _PERSISTENCE = PersistenceOptions()
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from maplab_py.algorithms.evaluation import reports
 from maplab_py.algorithms.evaluation.options import TrajectoryEvaluationOptions
+from maplab_py.algorithms.map_update.options import ChangeReport
 from maplab_py.console.session.session import MEASURED
 from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, UserError, command
 from maplab_py.vimap import VIMap
@@ -76,17 +77,26 @@ def evaluate_trajectory(
     example="compare_maps before_optvi",
     see_also=("import_colmap", "evaluate_trajectory"),
 )
-def compare_maps(context: CommandContext, other_map: str) -> reports.MapComparisonReport:
+def compare_maps(
+    context: CommandContext, other_map: str, *, changes: bool = False
+) -> reports.MapComparisonReport | ChangeReport:
     """Show how the selected map and another one differ; rows are matched by their ids.
 
     Poses and landmarks are compared in G. An observation is a keypoint with its landmark.
 
     Args:
         other_map: Key of a map in memory, or folder of a map.
+        changes: Place the other map in the selected one as a later session, and list the regions that
+            vanished, appeared or moved.
     """
+    other = map_of_key_or_folder(context, other_map)
+    if changes:
+        from maplab_py.algorithms.map_update.update import changes_since
+
+        return changes_since(context.vi_map, other, progress=context.progress)
     from maplab_py.algorithms.evaluation import map_comparison
 
-    return map_comparison.compare_maps(context.vi_map, map_of_key_or_folder(context, other_map))
+    return map_comparison.compare_maps(context.vi_map, other)
 
 
 def map_of_key_or_folder(context: CommandContext, name: str) -> VIMap:

@@ -31,10 +31,9 @@ def update_map(
 ) -> MapUpdateReport:
     """Update the map with a new session, and keep it within a budget.
 
-    The session is keyframed, anchored, merged and optimised while most of the map is held fixed. What it
-    should have seen and what it saw becomes evidence. Landmarks that hardly exist any more are removed;
-    beyond the budget also those that are least useful, and vertices that others cover. Missions that lose
-    vertices lose their inertial measurements: their poses are joined by odometry edges.
+    What the session should have seen and what it saw becomes evidence. Landmarks that hardly exist any more
+    are removed; beyond the budget also the least useful ones, and vertices that others cover. Missions that
+    lose vertices lose their inertial measurements: odometry edges join their poses.
 
     Args:
         session: Key of a map in memory, or folder of a map, with the missions of the session.

@@ -45,6 +45,7 @@ class LocalizationMap:
     p_G_observer: F64  # (K, 3)
     observer_id: U64 | None  # (K, 2) ids of the observing vertices
     projection: DescriptorProjection
+    landmark: I64 | None = None  # (L,) rows in the map that it was made from
 
     @property
     def has_descriptors(self) -> bool:
@@ -142,6 +143,7 @@ def database_of_map(
         p_G_observer=judged.T_G_I[vertices, 4:],
         observer_id=judged.vertices.id[vertices],
         projection=projection,
+        landmark=landmarks,
     )
 
 

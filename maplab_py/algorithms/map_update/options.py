@@ -37,6 +37,32 @@ class EvidenceReport(Report):
 
 
 @dataclasses.dataclass(frozen=True)
+class Change:
+    """A region that changed."""
+
+    change: str  # vanished, appeared or moved
+    x_m: float  # its middle in G
+    y_m: float
+    z_m: float
+    size_m: float
+    missing: int  # landmarks that only one side saw
+    around: int  # landmarks there that both should have seen
+    to_m: str  # where it moved to, in G
+
+
+@dataclasses.dataclass(frozen=True)
+class ChangeReport(Report):
+    """Regions that changed between the earlier and the later sessions."""
+
+    changes: tuple[Change, ...]
+    earlier: str  # begin of the last earlier session
+    later: str  # begin of the first later session
+    landmarks_missed: int  # of the earlier sessions, by the later ones, changed or not
+    landmarks_new: int  # of the later sessions, not seen by the earlier ones
+    note: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
 class GatheringReport(Report):
     """Evidence of the sessions of a map, and how probable it is that landmarks exist."""
 

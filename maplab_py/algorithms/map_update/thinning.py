@@ -142,9 +142,7 @@ def _within(
     is_new = vi_map.mission_index.rows(new_missions)
     old = np.setdiff1d(vi_map.vertices.mission[removed], is_new)
     vi_map = with_odometry_instead_of_imu(remove_vertices(vi_map, removed), old)
-    idle = vi_map.keypoints.landmark < 0
-    idle &= ~np.isin(vi_map.vertices.mission[vi_map.keypoint_vertex], is_new)
-    vi_map = remove_keypoints(vi_map, idle)
+    vi_map = remove_keypoints(vi_map, vi_map.keypoints.landmark < 0)
     return remove_landmarks(vi_map, np.diff(vi_map.observation_start) == 0), len(old)
 
 

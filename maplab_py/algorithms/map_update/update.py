@@ -29,12 +29,15 @@ from maplab_py.algorithms.landmarks.triangulation import retriangulate
 from maplab_py.algorithms.loop_closure.features import ProjectionMemory, SearchScope
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.workflow import close_loops
+from maplab_py.algorithms.map_update.changes import find_changes
 from maplab_py.algorithms.map_update.options import (
+    ChangeReport,
     EvidenceReport,
     GatheringReport,
     MapUpdateReport,
     UpdateOptions,
 )
+from maplab_py.algorithms.map_update.placing import Placed, place, with_matches
 from maplab_py.algorithms.map_update.thinning import size_mb, thin
 from maplab_py.algorithms.map_update.visibility import outcome, predict
 from maplab_py.algorithms.vi_optimization.local import optimize_around
@@ -161,27 +164,73 @@ def merge_session(
         MapError: The session does not fit the map, or is in it already.
         EstimationError: The session cannot be anchored in the map, or not be optimised.
     """
-    unknown = session.baseframes.replace(is_known=np.zeros(len(session.baseframes), dtype=np.bool_))
-    whole, _ = merge_maps(vi_map, session.replace(baseframes=unknown))
-    whole, report = anchor_missions(whole, loop_options=loops, progress=progress)
+    placed = place(vi_map, session, progress)
+    whole, _ = merge_maps(vi_map, _at_place(session, placed))
     ids = session.missions.id
-    known = whole.baseframes.is_known[whole.missions.baseframe]
-    missing = whole.mission_index.rows(ids)[~known[whole.mission_index.rows(ids)]]
-    if len(missing):
-        raise EstimationError(
-            f"mission {to_hex(whole.missions.id[missing[0]])[:8]} of the session cannot be anchored "
-            f"in the map: {report.failure or 'too few places are recognised'}"
-        )
-    merged = 0
-    is_new = np.isin(whole.vertices.mission, whole.mission_index.rows(ids))
-    scope = SearchScope(is_new, ProjectionMemory())  # loops of the others were closed before
-    for _ in range(2):
-        whole, closed = close_loops(whole, loops, scope=scope, progress=progress)
-        merged += closed.landmarks_merged
-        whole = _optimized(whole, ids, progress)
+    if len(placed.missions) < len(session.missions):
+        whole = _anchored(whole, ids, loops, progress)
+    landmark = whole.landmark_index.rows(vi_map.landmarks.id[placed.landmark])
+    # the keypoints of the session follow those of the map
+    keypoint = placed.keypoint + len(vi_map.keypoints)
+    whole, merged = with_matches(whole, keypoint[landmark >= 0], landmark[landmark >= 0])
+    whole = _optimized(whole, ids, progress)
+    for mission in whole.mission_index.rows(ids).tolist():
+        seen = predict(whole, mission, progress)
+        matched = seen.keypoint >= 0
+        whole, count = with_matches(whole, seen.keypoint[matched], seen.landmark[matched])
+        merged += count
+    whole = _optimized(whole, ids, progress)
     quality = LandmarkQualityOptions(min_observers=_MIN_OBSERVERS)
     rows = whole.mission_index.rows(ids)
     return evaluate_quality(whole, quality, missions=rows, progress=progress)[0], merged
+
+
+def changes_since(
+    vi_map: VIMap,
+    session: VIMap,
+    *,
+    assign_new_ids: bool = False,
+    progress: Progress = SILENT,
+) -> ChangeReport:
+    """Return the regions in which a session differs from a map; neither is changed.
+
+    Raises:
+        MapError: The session does not fit the map, or is in it already.
+        EstimationError: The session cannot be anchored in the map, or not be optimised.
+    """
+    if assign_new_ids:
+        session = with_new_ids(session, content_rng(vi_map, "changes", session))
+    check_disjoint(vi_map, session)
+    prepared = prepare_session(session, progress=progress)
+    whole, _ = merge_session(vi_map, prepared, progress=progress)
+    later = np.zeros(len(whole.missions), dtype=np.bool_)
+    later[whole.mission_index.rows(prepared.missions.id)] = True
+    return find_changes(whole, later, progress)
+
+
+def _at_place(session: VIMap, placed: Placed) -> VIMap:
+    """Return a session with the base frames of placed missions known, all others unknown."""
+    rows = session.missions.baseframe[placed.missions]
+    T_G_M = session.baseframes.T_G_M.copy()
+    is_known = np.zeros(len(session.baseframes), dtype=np.bool_)
+    T_G_M[rows], is_known[rows] = placed.T_G_M, True
+    return session.replace(baseframes=session.baseframes.replace(T_G_M=T_G_M, is_known=is_known))
+
+
+def _anchored(
+    whole: VIMap, missions: IdArray, loops: LoopClosureOptions, progress: Progress
+) -> VIMap:
+    """Return the map with missions (ids) anchored and merged by closures of loops."""
+    whole, report = anchor_missions(whole, loop_options=loops, progress=progress)
+    rows = whole.mission_index.rows(missions)
+    unknown = rows[~whole.baseframes.is_known[whole.missions.baseframe[rows]]]
+    if len(unknown):
+        raise EstimationError(
+            f"mission {to_hex(whole.missions.id[unknown[0]])[:8]} of the session cannot be anchored "
+            f"in the map: {report.failure or 'too few places are recognised'}"
+        )
+    scope = SearchScope(np.isin(whole.vertices.mission, rows), ProjectionMemory())
+    return close_loops(whole, loops, scope=scope, progress=progress)[0]
 
 
 def _optimized(whole: VIMap, missions: IdArray, progress: Progress) -> VIMap:

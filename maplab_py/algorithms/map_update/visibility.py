@@ -35,8 +35,8 @@ _AROUND_PX, _AROUND = 60.0, 3
 """Observed landmarks within this distance say what is seen around a landmark: the nearest few."""
 _DESCRIPTORS = 12
 """Observations of a landmark whose descriptors are compared."""
-_BIT_FACTOR = 0.75
-"""Limit of a match as a share of what lc allows, as in its guided matching."""
+_MIN_MATCHED, _MIN_MATCHED_SHARE = 8, 0.3
+"""Landmarks that an image must match, in number and as a share, before it counts that others are missing."""
 _PLACE_M, _SECTORS = 1.0, 8
 """Images of one place: within a cell of that size, in the same of so many directions."""
 
@@ -79,6 +79,7 @@ class Sightings:
     frame: I64
     landmark: I64
     heading_rad: F64  # of the optical axis
+    keypoint: I64  # that looks like the landmark, -1 = none
     is_matched: Mask
     is_false: Mask  # a random other landmark would have been matched there, too
 
@@ -95,8 +96,8 @@ def predict(vi_map: VIMap, mission: int, progress: Progress = SILENT) -> Sightin
     for number, frame in enumerate(frames.tolist()):
         progress.step(number, len(frames), "images")
         parts.append(search.sightings(frame))
-    columns = zip(*parts, strict=True) if parts else ([],) * 5
-    kinds = (np.int64, np.int64, np.float64, np.bool_, np.bool_)
+    columns = zip(*parts, strict=True) if parts else ([],) * 6
+    kinds = (np.int64, np.int64, np.float64, np.int64, np.bool_, np.bool_)
     empty = (np.zeros(0, dtype=kind) for kind in kinds)
     return Sightings(*(np.concatenate([e, *c]) for e, c in zip(empty, columns, strict=True)))
 
@@ -140,8 +141,7 @@ class _Search:
         self._words = kind.comparable(
             np.ascontiguousarray(vi_map.keypoints.descriptor[:, : kind.size])
         )
-        limit = kind.largest(options.max_bit_fraction, options.max_descriptor_distance)
-        self._limit = _BIT_FACTOR * limit
+        self._limit = kind.largest(options.max_bit_fraction, options.max_descriptor_distance)
         others = others[self._described[others]]
         landmark = vi_map.keypoints.landmark[others]
         order = np.lexsort((-others, landmark))  # the newest first
@@ -150,14 +150,14 @@ class _Search:
         self._is_good = vi_map.landmarks.quality == LandmarkQuality.GOOD
         self._random = np.random.default_rng(0).permutation(self._old)  # landmarks for comparison
 
-    def sightings(self, frame: int) -> tuple[I64, I64, F64, Mask, Mask]:
+    def sightings(self, frame: int) -> tuple[I64, I64, F64, I64, Mask, Mask]:
         """Return the columns of the sightings of an image."""
         vi_map = self._map
         start = vi_map.keypoint_start
         keypoints = np.arange(start[frame], start[frame + 1])
         none = np.zeros(0, dtype=np.int64)
         no = none.astype(np.bool_)
-        nothing = none, none, none.astype(np.float64), no, no
+        nothing = none, none, none.astype(np.float64), none, no, no
         if len(keypoints) == 0 or len(self._old) == 0:
             return nothing
         camera, T_I_C, _ = next(iter(cameras_of(vi_map, keypoints[:1])))
@@ -171,15 +171,20 @@ class _Search:
         if len(rows) == 0:
             return nothing
         near = self._near(keypoints, uv)
-        is_matched = self._is_similar(rows, *near)
-        is_matched |= np.isin(rows, vi_map.keypoints.landmark[keypoints])
+        similar = self._most_similar(rows, *near)
+        is_matched = (similar >= 0) | np.isin(rows, vi_map.keypoints.landmark[keypoints])
         other = self._random[np.searchsorted(self._old, rows)]
-        is_false = self._is_similar(other, *near)
+        is_false = self._most_similar(other, *near) >= 0
         kept = is_matched | ~self._is_hidden(keypoints, uv, depth_m, T_G_C[4:])
         rows = rows[kept]
         axis_G = so3.rotate(T_G_C[:4], np.array([0.0, 0.0, 1.0]))
         heading = np.full(len(rows), np.arctan2(axis_G[1], axis_G[0]))
-        return np.full(len(rows), frame), rows, heading, is_matched[kept], is_false[kept]
+        similar, is_matched, is_false = similar[kept], is_matched[kept], is_false[kept]
+        frames = np.full(len(rows), frame)
+        if np.count_nonzero(is_matched) >= max(_MIN_MATCHED, _MIN_MATCHED_SHARE * len(rows)):
+            return frames, rows, heading, similar, is_matched, is_false
+        m = is_matched  # the pose is doubtful: what the image does not see may be elsewhere in it
+        return frames[m], rows[m], heading[m], similar[m], is_matched[m], is_false[m]
 
     def _in_reach(self, eye: F64) -> I64:
         """Return the old landmarks that are seen from a place (3,), as far as direction and distance tell."""
@@ -197,15 +202,17 @@ class _Search:
         index, column = np.nonzero(np.einsum("nki,nki->nk", offset, offset) < _RADIUS_PX**2)
         return index, mine[column]
 
-    def _is_similar(self, landmarks: I64, index: I64, keypoint: I64) -> Mask:
-        """Return which landmarks (N,) look like one of their keypoints."""
+    def _most_similar(self, landmarks: I64, index: I64, keypoint: I64) -> I64:
+        """Return the keypoint (N,) that looks most like each landmark among its own; -1 = none does."""
         counts = np.minimum(np.diff(self._start)[landmarks], _DESCRIPTORS)[index]
         owner = np.repeat(np.arange(len(index)), counts)
         within = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
         row = self._rows[self._start[landmarks[index[owner]]] + within]
         bits = differences(self._words, keypoint[owner], self._words, row)
-        result = np.zeros(len(landmarks), dtype=np.bool_)
-        result[index[owner[bits <= self._limit]]] = True
+        similar = np.flatnonzero(bits <= self._limit)
+        order = similar[np.argsort(-bits[similar], kind="stable")]
+        result = np.full(len(landmarks), -1, dtype=np.int64)
+        result[index[owner[order]]] = keypoint[owner[order]]  # the last one stays
         return result
 
     def _is_hidden(self, keypoints: I64, uv: F64, depth_m: F64, eye: F64) -> Mask:

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from maplab_py.algorithms.landmarks.evidence import has_evidence, read_evidence
+from maplab_py.algorithms.map_update.changes import find_changes
 from maplab_py.algorithms.map_update.options import UpdateOptions
-from maplab_py.algorithms.map_update.update import prepare_session, update_map
+from maplab_py.algorithms.map_update.update import changes_since, prepare_session, update_map
 from maplab_py.console.session.session import Session
 from maplab_py.errors import MapError, UserError
 from maplab_py.simulation.scenario import ChangeOptions, SessionOptions
@@ -105,3 +106,29 @@ def test_mistakes_are_one_line() -> None:
         session.run("update_map", session="nowhere")
     with pytest.raises(UserError, match="2027-01-31"):
         session.run("gather_evidence", date="tomorrow")
+
+
+@pytest.mark.slow
+def test_furniture_that_moves_is_a_change_and_an_unchanged_room_has_none() -> None:
+    scenario = dataclasses.replace(
+        YEAR,
+        world=dataclasses.replace(YEAR.world, furniture_per_room=6, landmarks_per_room=2500),
+        measurement=dataclasses.replace(YEAR.measurement, max_keypoints=400),
+        appearance=dataclasses.replace(YEAR.appearance, vanish_share=0.0),
+        changes=ChangeOptions(refurbished_session=2, refurbished_share=1.0, refurbished_posters=0),
+        sessions=tuple(
+            dataclasses.replace(SCAN, duration_s=14.0, turns=1.0, height_m=h)
+            for h in (1.5, 1.4, 1.5)
+        ),
+    )
+    maps = simulate(scenario).maps
+    before = prepare_session(maps[0])
+    known = before.baseframes.replace(is_known=np.ones(1, dtype=np.bool_))
+    before = before.replace(baseframes=known)
+    assert changes_since(before, maps[1]).changes == ()
+    two, _ = update_map(before, maps[1])
+    report = changes_since(two, maps[2])
+    assert {change.change for change in report.changes} == {"vanished", "appeared"}
+    assert max(change.size_m for change in report.changes) > 0.5
+    with pytest.raises(UserError, match="earlier and later"):
+        find_changes(two, np.zeros(2, dtype=np.bool_))
