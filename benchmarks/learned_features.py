@@ -77,8 +77,8 @@ def measure(
 
     With less light than 1 every other keyframe is darker, and its pairs with the others count.
     """
-    options = LoopClosureOptions()
     title, features = features, "xfeat" if features == _MATCHER else features
+    options = LoopClosureOptions(feature_type=str(KINDS[features].feature_type))
     recording = reader_choice.open_recording(shared_data_folder() / "euroc_v101_keyframes")
     cameras, T_I_C = recording.device.cameras, recording.device.T_I_C
     sets = [event for event in EventStream(recording) if isinstance(event, protocol.FrameSet)]
@@ -111,13 +111,14 @@ def measure(
         matches = _match_by_network(found, frames, pairs, images[0][0])
     else:
         matches = [_match(frames[a], frames[b]) for a, b in pairs.tolist()]
+    needed = round(options.inlier_factor * options.min_inlier_count)
     for gate in gates:
         most = kind.largest(gate, gate)
         chosen = [(i[gap <= most], j[gap <= most]) for i, j, gap in matches]
         inliers, is_right = _verify(frames, T_G_I, pairs, chosen, options)
         wrong = inliers[~is_right]
-        threshold = max(int(wrong.max(initial=0)) + 1, options.min_inlier_count)
-        accepted = inliers >= options.min_inlier_count
+        threshold = max(int(wrong.max(initial=0)) + 1, needed)
+        accepted = inliers >= needed
         results.append(
             Result(
                 features=title,

@@ -1,7 +1,8 @@
 """Localisation in rendered rooms under other light, by features: `python -m benchmarks.learned_rooms FOLDER`.
 
 The map is made by day. One session of queries crosses the room in a quarter of the light, another one is near
-the walls in an eighth of it, with gains that jump and more surfaces that are repainted.
+the walls in an eighth of it, with gains that jump and more surfaces that are repainted. For XFeat, closures
+between the sessions are counted, too, by nearest descriptors and by LighterGlue.
 """
 
 import argparse
@@ -21,6 +22,8 @@ from maplab_py.algorithms.localization.database import (
 )
 from maplab_py.algorithms.localization.localization import localize_missions
 from maplab_py.algorithms.localization.options import LocalizationOptions
+from maplab_py.algorithms.loop_closure.options import MATCHERS, LoopClosureOptions
+from maplab_py.algorithms.loop_closure.workflow import search_loops
 from maplab_py.algorithms.summary.options import SummaryMapOptions
 from maplab_py.algorithms.summary.summary import make_summary_map
 from maplab_py.geometry import se3, so3
@@ -30,6 +33,7 @@ from maplab_py.simulation.scenario import Scenario, SessionImages
 from maplab_py.simulation.truth import Truth, true_map
 from maplab_py.storage.native import load_map
 from maplab_py.vimap import VIMap
+from maplab_py.vimap.merge import merge_maps
 from maplab_py.vision.features.extractors import KINDS
 from tests.algorithms.image_features.test_rendered_loops import without_features
 
@@ -74,6 +78,25 @@ def _count(database: LocalizationMap, queries: VIMap) -> str:
     return f"{np.count_nonzero(right)} right, {np.count_nonzero(wrong)} wrong of {len(right)}"
 
 
+def _mapped(session: VIMap, features: str) -> VIMap:
+    tracked, _ = tracks.track_features(session, FeatureTrackOptions(feature_type=features))
+    return init_tracks(tracked, LandmarkQualityOptions())[0]
+
+
+def _closures(day: VIMap, query: VIMap, matcher: str) -> str:
+    """Return right and wrong accepted closures between two sessions in words; their poses are true."""
+    vi_map = merge_maps(day, _mapped(query, "xfeat"))[0]
+    options = LoopClosureOptions(feature_type="XFeat", matcher=matcher)
+    found = search_loops(vi_map, options)[0].closures
+    mission = vi_map.vertices.mission
+    a, b = found.query_vertex, found.place_vertex
+    counts = found.accepted & (mission[a] != mission[b])
+    T_G_I = se3.compose(vi_map.T_G_M[mission[b]], found.T_M_I)
+    distance = np.linalg.norm(vi_map.T_G_I[a, 4:] - T_G_I[:, 4:], axis=1)
+    right, wrong = counts & (distance < _RIGHT_M), counts & (distance > _WRONG_M)
+    return f"{np.count_nonzero(right)} right, {np.count_nonzero(wrong)} wrong"
+
+
 def main() -> None:
     """Render the sessions unless the folder has them, and print a line for each kind of map."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -88,8 +111,7 @@ def main() -> None:
         sessions.append(without_features(true_map(vi_map, truth)))
     for features in ("xfeat", "sift", "brisk", "orb"):
         day, dusk, night = (_described(session, features) for session in sessions)
-        tracked, _ = tracks.track_features(day, FeatureTrackOptions(feature_type=features))
-        vi_map, _ = init_tracks(tracked, LandmarkQualityOptions())
+        vi_map = _mapped(day, features)
         feature_type = KINDS[features].feature_type
         summary = make_summary_map(vi_map, SummaryMapOptions(), feature_type=feature_type)
         databases = {
@@ -99,6 +121,12 @@ def main() -> None:
         for kind, database in databases.items():
             print(
                 f"{features:6} {kind:8} dusk: {_count(database, dusk):28} night: {_count(database, night)}",
+                flush=True,
+            )
+        for matcher in MATCHERS if features == "xfeat" else ():
+            by_session = [_closures(vi_map, query, matcher) for query in (dusk, night)]
+            print(
+                f"closures by {matcher:11} dusk: {by_session[0]:20} night: {by_session[1]}",
                 flush=True,
             )
 

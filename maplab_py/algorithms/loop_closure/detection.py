@@ -218,7 +218,8 @@ def _search(
         )
 
     first = poses(matches, candidates)
-    weak = np.flatnonzero(first.solutions.inlier_count < options.min_inlier_count)
+    needed = options.inlier_factor * options.min_inlier_count
+    weak = np.flatnonzero(first.solutions.inlier_count < needed)
     if options.matcher == "nearest" or not len(weak):
         return first, ()
     from maplab_py.algorithms.loop_closure.second_matching import match_again
@@ -228,7 +229,7 @@ def _search(
     better = count > first.solutions.inlier_count[weak]
     row = np.arange(len(candidates.query_vertex))
     row[weak[better]] = len(row) + np.flatnonzero(better)
-    enough = np.count_nonzero(count >= options.min_inlier_count)
+    enough = np.count_nonzero(count >= needed)
     again = f"LighterGlue matched {counted(len(weak), 'candidate')} again"
     note = f"{again}: {enough} of them have enough inliers"
     return _joined([first, second]).take(row), (note,)

@@ -53,8 +53,8 @@ def pose_gates(c: GateValues | ClosureRecord, o: LoopClosureOptions) -> list[Gat
     """Return the gates on the pose of a closure."""
     return [
         Gate.of(
-            "inliers", c.inliers, o.min_inlier_count, Verdict.FEW_INLIERS.value,
-            "--lc_min_inlier_count", is_minimum=True,
+            "inliers", c.inliers, o.inlier_factor * o.min_inlier_count, Verdict.FEW_INLIERS.value,
+            "--lc_min_inlier_count", is_minimum=True, flag_value=c.inliers / o.inlier_factor,
         ),
         Gate.of(
             "inliers / matches", c.inliers / np.maximum(c.matches, 1), o.min_inlier_ratio,

@@ -8,6 +8,9 @@ _BYTES_OF_DESCRIPTORS = {"": (), "brisk": (48, 64), "freak": (64,), "orb": (32,)
 """Lengths of binary descriptors: of BRISK, C++ maplab's and OpenCV's."""
 
 MATCHERS = ("nearest", "lighterglue")
+_INLIER_FACTORS: dict[int, float] = {FeatureType.XFEAT: 1.25}
+"""Its distances let more wrong matches pass. Of recorded pairs with a quarter of the light on one side, the
+only wrong pose of 12 or more has 14, the right ones 21 and more."""
 
 
 class FeatureTypeOptions(Options, prefix="lc_"):
@@ -76,7 +79,7 @@ class LoopClosureOptions(FeatureTypeOptions):
     num_ransac_iters: int = 300
     """Largest number of samples of matches per query vertex"""
     min_inlier_count: int = 12
-    """Keypoints that must agree with the pose"""
+    """Keypoints that must agree with the pose, a quarter more for XFeat"""
     min_inlier_ratio: float = 0.1
     """Fraction of the query's keypoints matched in the place that must agree"""
     max_gravity_deviation_deg: float = 3.0
@@ -126,6 +129,11 @@ class LoopClosureOptions(FeatureTypeOptions):
     """Search places of other missions only"""
     seed: int = 0
     """Seed of all random choices"""
+
+    @property
+    def inlier_factor(self) -> float:
+        """Required inliers relative to the flag's value."""
+        return _INLIER_FACTORS.get(self.type_number, 1.0)
 
     def __post_init__(self) -> None:
         """Check that matcher and type fit.

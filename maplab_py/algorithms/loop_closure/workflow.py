@@ -211,7 +211,7 @@ def _explanation(detection: Detection, options: LoopClosureOptions) -> str:
     refused = ", ".join(f"{why}: {n}" for why, n in c.refused_by_reason().items())
     return (
         f"no loop closures: best of {len(c)} candidates has {c.inliers[best]} inliers (needed "
-        f"{options.min_inlier_count}), ratio {ratio[best]:.2f} (needed "
+        f"{options.inlier_factor * options.min_inlier_count:g}), ratio {ratio[best]:.2f} (needed "
         f"{options.min_inlier_ratio:g}), tilt {c.tilt_deg[best]:.1f} deg, {c.support[best]} "
         f"supporters (needed {options.min_support}), correction {c.correction_m[best]:.2f} m; "
         f"refused: {refused}"

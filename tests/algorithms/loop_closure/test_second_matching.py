@@ -15,10 +15,10 @@ from tests.algorithms.loop_closure.rooms import Walk, make_map
 from tests.support.float_features import with_numbers
 
 STRICT = LoopClosureOptions(
-    feature_type="XFeat", max_descriptor_distance=0.55, min_inlier_count=115, min_support=1
+    feature_type="XFeat", max_descriptor_distance=0.55, min_inlier_count=92, min_support=1
 )
 AGAIN = LoopClosureOptions(
-    feature_type="XFeat", max_descriptor_distance=0.55, min_inlier_count=115, min_support=1,
+    feature_type="XFeat", max_descriptor_distance=0.55, min_inlier_count=92, min_support=1,
     matcher="lighterglue",
 )  # fmt: skip
 
@@ -55,7 +55,7 @@ def test_weak_candidates_are_matched_again(monkeypatch: pytest.MonkeyPatch) -> N
     few, many = nearest.closures, again.closures
     assert len(few) == len(many) > 0
     assert np.array_equal(few.query_vertex, many.query_vertex)
-    weak = few.inliers < STRICT.min_inlier_count
+    weak = few.inliers < 1.25 * STRICT.min_inlier_count
     assert network.pairs == np.count_nonzero(weak) > 0
     assert (many.inliers >= few.inliers).all()
     assert np.array_equal(many.inliers[~weak], few.inliers[~weak])
@@ -75,6 +75,6 @@ def test_without_the_network_or_with_other_features_it_is_said(
         LoopClosureOptions(matcher="lighterglue")
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     vi_map = with_numbers(make_map([Walk(room=1), Walk(room=1, mission=1)])[0], FeatureType.XFEAT)
-    options = LoopClosureOptions(feature_type="XFeat", matcher="lighterglue", min_inlier_count=1150)
+    options = LoopClosureOptions(feature_type="XFeat", matcher="lighterglue", min_inlier_count=920)
     with pytest.raises(UserError, match="LighterGlue is not installed on this computer"):
         search_loops(vi_map, options)
