@@ -95,7 +95,8 @@ def _run(
     except EstimationError as error:
         return error
     mapping.doubts = ()
-    if mapping.builder is not None:
+    # a sensor that fails contradicts any calibration
+    if mapping.builder is not None and not mapping.odometry.watch.failures:
         with contextlib.suppress(EstimationError):  # fewer than two vertices are no map
             mapping.doubts = check_map(mapping.builder.make_map())
     return None

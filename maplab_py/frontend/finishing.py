@@ -138,6 +138,8 @@ def _has_wrong_calibration(
     """Tell whether the calibration was mended, or is contradicted by the residuals of the map."""
     if is_to_end() or not mapping.options.odometry.apply_calibration:
         return False
+    if mapping.odometry.watch.failures:
+        return False
     try:
         return mapping.is_mended or contradicted_calibration(vi_map, progress)
     except EstimationError:  # nothing in the map can be optimised
@@ -248,8 +250,14 @@ def _stream_notes(mapping: Mapping) -> list[str]:
 
 def _calibration_notes(mapping: Mapping) -> list[str]:
     """Return what of the calibration was doubted, and what was found in its place."""
-    odometry = mapping.odometry
+    odometry, zero_ns = mapping.odometry, mapping.statistics.zero_ns
     notes, delays = list(odometry.notes), odometry.delays
+    notes += [failure.words(zero_ns) for failure in odometry.watch.failures]
+    if odometry.watch.failures:
+        notes.append(
+            "where a part of the IMU was left out, the map has samples that follow from the images; after "
+            "a failure calibrate again (self_calibrate), with a recording of whole sensors"
+        )
     if delays is not None and delays.applied_s:
         notes.append(
             f"the images were taken {1e3 * delays.delay_s:+.1f} +- {1e3 * delays.sigma_s:.1f} ms after "

@@ -168,6 +168,7 @@ class Mapping:
             if backfill is not None:
                 self.builder.fill(backfill)
             self.builder.refine(self.odometry.window_states())
+            self.builder.replace_samples(self.odometry.watch)
         self.odometry.find_calibration()
         estimate = self.odometry.calibration_estimate
         if estimate is None or not estimate.differs or not self.options.odometry.apply_calibration:
@@ -238,7 +239,12 @@ class Mapping:
         now_s = time.perf_counter()
         if now_s >= self._next_status_s:
             self._next_status_s = now_s + _STATUS_EVERY_S
-            line = f"{self.statistics.status_line(update)}  {self._status()}".rstrip()
+            words = (
+                self.statistics.status_line(update),
+                self.odometry.watch.status(),
+                self._status(),
+            )
+            line = "  ".join(filter(None, words))
             progress.step(self.statistics.elapsed_s, self._total_s(), line)
 
     def _total_s(self) -> float:

@@ -82,6 +82,11 @@ class MotionDetector:
             return Motion.RESTING
         return Motion.TURNING if tracked.is_turn_only else Motion.MOVING
 
+    def is_moving(self, interval: ImuInterval, turn_rad: float) -> bool:
+        """Tell whether the samples alone say that the device does not rest."""
+        is_turning = turn_rad > self._options.max_turn_rate * interval.duration_s
+        return is_turning or self.acceleration_deviation > self._options.max_acceleration_deviation
+
     def visible_mps(self, depth_m: float, focal_px: float) -> float:
         """Return the speed at which points at a distance move surely faster than the limits of rest."""
         rate_px = self._options.max_disparity_px / _DISPARITY_TIME_S

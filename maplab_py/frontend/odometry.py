@@ -12,11 +12,12 @@ from maplab_py.array_types import F64, I64, U8
 from maplab_py.errors import EstimationError, MapError, UserError
 from maplab_py.estimation.linear.threads import single_thread
 from maplab_py.estimation.window.calibration import CalibrationEstimate, WindowCalibration
-from maplab_py.estimation.window.frame import Motion, WindowFrame
+from maplab_py.estimation.window.frame import ImuPart, Motion, WindowFrame
 from maplab_py.estimation.window.localized import LocalizedSmoother
 from maplab_py.estimation.window.options import MapRule
 from maplab_py.estimation.window.smoother import FixedLagSmoother
 from maplab_py.frontend.backfill import Backfill, Backfiller
+from maplab_py.frontend.failures.watch import SensorWatch
 from maplab_py.frontend.gyroscope import turn
 from maplab_py.frontend.health import HealthMonitor
 from maplab_py.frontend.image_delay import DelayMonitor
@@ -25,7 +26,7 @@ from maplab_py.frontend.initialization.imu_noise import plausible_noise
 from maplab_py.frontend.initialization.initializer import Initializer
 from maplab_py.frontend.motion import MotionDetector
 from maplab_py.frontend.odometry_options import OdometryOptions
-from maplab_py.frontend.odometry_update import OdometryStatus, OdometryUpdate
+from maplab_py.frontend.odometry_update import OdometryCounts, OdometryStatus, OdometryUpdate
 from maplab_py.frontend.starting import MakeStarter, Start, Starter
 from maplab_py.geometry import so3
 from maplab_py.interop.recordings.protocol import (
@@ -46,17 +47,6 @@ _DELAY_STEP_NS = 2_000_000
 """Largest change of the delay of images from one frame to the next while the window has states."""
 _NOISE_TIME_NS = 900_000_000
 """Time after which the samples are compared with the calibrated noise."""
-
-
-@dataclasses.dataclass(eq=False)
-class OdometryCounts:
-    """Counts of the odometry."""
-
-    frames: int = 0
-    frames_before_imu: int = 0
-    saturated_samples: int = 0
-    imu_gaps: int = 0  # that made it start again
-    starts: int = 0
 
 
 class Odometry:
@@ -113,6 +103,7 @@ class Odometry:
         self._delays: DelayMonitor | None = None
         if make_starter is None and self.options.estimates_time_offset:
             self._delays = DelayMonitor(device)
+        self.watch = SensorWatch(device, device.imu)  # of sensors that fail
         self.notes: list[str] = []  # what is wrong with the calibration
         self._noise_is_open = make_starter is None and self.options.imu_noise == "auto"
         self._delay_ns = 0  # that frames have in addition to the calibrated offset
@@ -271,7 +262,11 @@ class Odometry:
                 self._gap_end_ns = -1
         self.counts.frames += 1
         self._last_ns = time_ns
-        tracked, images = self._tracked(frame_set, interval)
+        measured, failed = interval, ImuPart(0)
+        if interval is not None:
+            interval, failed = self.watch.usable(interval, self._smoother)
+        tracked, images = self._tracked(frame_set, interval, failed)
+        tracked = self.watch.without_failed(tracked)
         motion = Motion.MOVING
         if interval is not None:
             motion = self._detector.classify(
@@ -281,6 +276,8 @@ class Odometry:
                 speed_mps=self._speed_mps,
                 visible_mps=self._visible_mps(),
             )
+            if failed and motion is Motion.RESTING:
+                motion = Motion.MOVING
         update = OdometryUpdate(
             time_ns=time_ns,
             stamp_ns=frame_set.time_ns,
@@ -297,10 +294,17 @@ class Odometry:
         )
         if self._gap_end_ns >= 0:
             return update
-        frame = dataclasses.replace(update.window_frame(), delay_s=1e-9 * self._delay_ns)
+        frame = dataclasses.replace(
+            update.window_frame(), delay_s=1e-9 * self._delay_ns, failed=failed
+        )
         has_new_delay = self._measure_delay(update, frame)
         if self._smoother is not None:
-            return self._smoothed(update, frame, self._smoother)
+            update = self._smoothed(update, frame, self._smoother)
+            if self._smoother is not None and measured is not None:
+                begin = time.perf_counter()
+                self.watch.compare(frame, measured, self._smoother)
+                update.stage_ms["compare"] = 1e3 * (time.perf_counter() - begin)
+            return update
         self._backfiller.waiting.push(update.stamp_ns, frame, self._buffer.samples)
         self._check_noise()
         if has_new_delay:
@@ -339,10 +343,12 @@ class Odometry:
         return note if is_first else "waiting for the end of the gap between IMU samples"
 
     def _tracked(
-        self, frame_set: FrameSet | TrackedFrameSet, interval: ImuInterval | None
+        self, frame_set: FrameSet | TrackedFrameSet, interval: ImuInterval | None, failed: ImuPart
     ) -> tuple[TrackedImages, tuple[U8, ...]]:
         """Return the tracks of a frame set, and its images if it has some."""
-        R_I0_I1 = None if interval is None else turn(self._imu, interval, self._gyro_bias)
+        R_I0_I1 = None
+        if interval is not None and ImuPart.GYROSCOPE not in failed:
+            R_I0_I1 = turn(self._imu, interval, self._gyro_bias)
         if isinstance(frame_set, TrackedFrameSet):
             self._replayed = tracked_images_of(
                 frame_set,
@@ -356,8 +362,17 @@ class Odometry:
         begin = time.perf_counter()
         images = tuple(image.grey() for image in frame_set.images)
         read_ms = 1e3 * (time.perf_counter() - begin)
+        begin = time.perf_counter()
+        if self._smoother is not None:
+            is_moving = interval is not None and self._detector.is_moving(
+                interval, self._turn_rad(interval)
+            )
+            self.watch.look(frame_set.time_ns, images, is_moving=is_moving)
+        self._tracker.leave_out(self.watch.left_out)
+        look_ms = 1e3 * (time.perf_counter() - begin)
         tracked = self._tracker.track(frame_set.time_ns, images, R_I0_I1)
-        return dataclasses.replace(tracked, stage_ms={"read": read_ms, **tracked.stage_ms}), images
+        stage_ms = {"read": read_ms, "watch": look_ms, **tracked.stage_ms}
+        return dataclasses.replace(tracked, stage_ms=stage_ms), images
 
     def _turn_rad(self, interval: ImuInterval) -> float:
         """Return the angle of a turn, 0 while the gyroscope's bias is not known."""
@@ -487,6 +502,7 @@ class Odometry:
         self._replayed = None
         self._detector.reset()
         self._backfiller.reset()
+        self.watch.restart()
         if self._delays is not None:
             self._delays.reset()
         return f"started again: {reason}" if reason else ""

@@ -23,6 +23,17 @@ class OdometryStatus(Enum):
     TRACKING = "tracking"
 
 
+@dataclasses.dataclass(eq=False)
+class OdometryCounts:
+    """Counts of the odometry."""
+
+    frames: int = 0
+    frames_before_imu: int = 0
+    saturated_samples: int = 0
+    imu_gaps: int = 0  # that made it start again
+    starts: int = 0
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class OdometryUpdate:
     """The result of one frame set."""

@@ -14,6 +14,7 @@ from maplab_py.frontend.reports import EstimatorStart, StageTime
 
 _GROUPS = {
     "read": "read",
+    "watch": "tracking",
     "prepare": "tracking",
     "flow": "tracking",
     "outliers": "tracking",
@@ -24,6 +25,7 @@ _GROUPS = {
     "delay": "initialise",
     "backfill": "initialise",
     "window": "window",
+    "compare": "window",
     "localise": "localise",
     "map": "map",
 }

@@ -76,6 +76,11 @@ class CalibrationBeside:
             return
         part = _without_descriptors(recorded.part(first, end))
         assert self._mapping is not None
+        if self._mapping.odometry.watch.has_failed_between(
+            self._begin_ns, int(part.states[-1].time_ns[0])
+        ):
+            self._begin_ns = int(part.states[-1].time_ns[0])
+            return
         if self._worker is None:
             opening = Opening(self._options, self._mapping.odometry.device)
             self._worker = _Worker(opening, self._options.processor_share)

@@ -92,7 +92,7 @@ class CameraSampler:
         image, before = self._preparation.prepare(grey), self._last
         uv = detection.refined(image, self._detector.detect(image, np.zeros((0, 2))))
         is_repeated = before is not None and np.array_equal(before[1], image)
-        self.figures.append(_figures(time_ns, image, len(uv), is_repeated))
+        self.figures.append(figures_of(time_ns, image, len(uv), is_repeated))
         if before is not None and time_ns - before[0] <= _LONGEST_S * 1e9:
             there, is_tracked = follow(before[1], image, before[2], before[2], _FLOW)
             both = np.stack([before[2][is_tracked], there[is_tracked]], axis=1)
@@ -122,7 +122,8 @@ class CameraSampler:
             self.pairs.append((last_ns, time_ns, uv))
 
 
-def _figures(time_ns: int, image: U8, corners: int, is_repeated: bool) -> ImageFigures:
+def figures_of(time_ns: int, image: U8, corners: int, is_repeated: bool) -> ImageFigures:
+    """Return the figures of an image (H, W)."""
     values = image[::2, ::2]
     step = np.abs(np.diff(image[::2].astype(np.int16), axis=1))
     width = step.shape[1] - _BLUR_SCALE + 1

@@ -1,7 +1,7 @@
 """Input and result of the smoother for a frame, and the state it starts from."""
 
 import dataclasses
-from enum import Enum
+from enum import Enum, IntFlag
 
 import numpy as np
 
@@ -16,6 +16,16 @@ class Motion(Enum):
     MOVING = "moving"
     TURNING = "turning"  # explained by rotation only
     RESTING = "resting"
+
+
+class ImuPart(IntFlag):
+    """Sensors of an IMU."""
+
+    GYROSCOPE = 1
+    ACCELEROMETER = 2
+
+
+NO_PART = ImuPart(0)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -35,6 +45,7 @@ class WindowFrame:
     sigma_px: F64  # (K,)
     motion: Motion = Motion.MOVING
     delay_s: float = 0.0  # by which its time differs from the stamps of its images
+    failed: ImuPart = NO_PART  # parts of the IMU whose samples say next to nothing
 
     def __post_init__(self) -> None:
         """Check the lengths."""

@@ -1,5 +1,6 @@
 """The inertial edges between neighbouring frames of a window, as a chain that grows and shrinks."""
 
+import dataclasses
 from types import ModuleType
 
 import numpy as np
@@ -8,6 +9,7 @@ from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import MapError
 from maplab_py.estimation.imu import inertial_data, preintegration
 from maplab_py.estimation.terms.inertial import measured_arguments, outdated_edges, whitening
+from maplab_py.estimation.window.frame import NO_PART, ImuPart
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Imu
 from maplab_py.vimap.table import starts_of_counts
@@ -19,8 +21,12 @@ _INPUTS, _MEASURED = 100, 74
 
 _COLUMNS = (
     "_arguments", "_whitening", "_integrated_at", "_seen_at",
-    "duration_s", "is_resting", "is_open", "_is_stale",
+    "duration_s", "is_resting", "is_open", "_is_stale", "_failed",
 )  # fmt: skip
+_FAILED_RATE, _FAILED_ACCELERATION = 0.2, 1.0
+"""Noise densities [rad/s/sqrt(Hz)], [m/s^2/sqrt(Hz)] of sensors that have failed: 0.9 rad/s and 4.5 m/s^2 in
+50 ms, as a hand's motion changes. Biases walk as far in a second, for they may have changed."""
+_FAILED_WALK = (0.2, 1.0)
 
 Samples = list[tuple[I64, F64]]
 """Times (S,) [ns] and values (S, 6) of the samples of each of some edges."""
@@ -35,6 +41,7 @@ class InertialChain:
     def __init__(self, kernel: ModuleType, imu: Imu) -> None:
         """Begin without edges; the kernel is that of the residual `inertial`."""
         self._kernel, self._imu = kernel, imu
+        self._imus = tuple(_with_failed(imu, ImuPart(parts)) for parts in range(4))
         self._g_M = np.array([0.0, 0.0, -imu.gravity_magnitude_mps2])
         self._samples: Samples = []
         self._arguments, self._whitening = np.zeros((0, _MEASURED)), np.zeros((0, 9, 9))
@@ -43,6 +50,7 @@ class InertialChain:
         self.is_resting: Mask = np.zeros(0, dtype=np.bool_)
         self.is_open: Mask = np.zeros(0, dtype=np.bool_)
         self._is_stale: Mask = np.zeros(0, dtype=np.bool_)
+        self._failed: I64 = np.zeros(0, dtype=np.int64)  # `ImuPart` of every edge
 
     def __len__(self) -> int:
         return len(self._samples)
@@ -50,24 +58,38 @@ class InertialChain:
     @property
     def walk_weight(self) -> F64:
         """Inverse standard deviations (E, 2) of the walk of a bias' component, gyroscope first."""
-        imu = self._imu
-        densities = [
-            imu.gyro_bias_random_walk_noise_density,
-            imu.acc_bias_random_walk_noise_density,
-        ]
+        densities = np.array(
+            [
+                (i.gyro_bias_random_walk_noise_density, i.acc_bias_random_walk_noise_density)
+                for i in self._imus
+            ]
+        )
         root_s = np.sqrt(np.maximum(self.duration_s, _SHORTEST_WALK_S))
-        weight = 1.0 / np.maximum(root_s[:, None] * np.array(densities), 1e-9)
+        weight = 1.0 / np.maximum(root_s[:, None] * densities[self._failed], 1e-9)
         return np.where(self.is_open[:, None], 0.0, weight)
 
-    def append(self, times_ns: I64, accel_gyro: F64, motion: F64, *, is_resting: bool) -> None:
+    def append(
+        self, times_ns: I64, accel_gyro: F64, motion: F64, *, is_resting: bool,
+        failed: ImuPart = NO_PART,
+    ) -> None:  # fmt: skip
         """Add the edge to a new frame; its biases are those in the motion (9,) of the last one.
 
         Raises:
             MapError: Times run backwards, or a sample is not a number.
         """
-        self.extend([(times_ns, accel_gyro)], motion[None], is_resting=is_resting)
+        self.extend([(times_ns, accel_gyro)], motion[None], is_resting=is_resting, failed=failed)
 
-    def extend(self, samples: Samples, motion: F64, *, is_resting: bool = False) -> None:
+    def doubt(self, since_ns: int, failed: ImuPart) -> None:
+        """Take parts of the IMU as failed in all edges that end after a time."""
+        for row, (times_ns, _) in enumerate(self._samples):
+            if int(times_ns[-1]) > since_ns and not self.is_open[row]:
+                self._failed[row] |= failed
+                self._is_stale[row] = True
+
+    def extend(
+        self, samples: Samples, motion: F64, *, is_resting: bool = False,
+        failed: ImuPart = NO_PART,
+    ) -> None:  # fmt: skip
         """Add N edges to new frames; their biases are those in the motion (N, 9) where they begin.
 
         Raises:
@@ -77,7 +99,7 @@ class InertialChain:
         new = (
             np.zeros((count, _MEASURED)), np.zeros((count, 9, 9)), biases, biases,
             np.zeros(count), np.full(count, is_resting), np.zeros(count, dtype=np.bool_),
-            np.ones(count, dtype=np.bool_),
+            np.ones(count, dtype=np.bool_), np.full(count, int(failed)),
         )  # fmt: skip
         self._samples += samples
         for name, values in zip(_COLUMNS, new, strict=True):
@@ -116,6 +138,7 @@ class InertialChain:
         self._samples[frame - 1] = times_ns, accel_gyro
         self._integrated_at[frame - 1], self._is_stale[frame - 1] = motion[3:], True
         self.is_resting[frame - 1] &= self.is_resting[frame]
+        self._failed[frame - 1] |= self._failed[frame]
         self.duration_s[frame - 1] += self.duration_s[frame]
         self._drop(frame)
 
@@ -169,13 +192,15 @@ class InertialChain:
         residual, jacobian = self._kernel.evaluated(arguments, self._whitening[edges])
         return residual, jacobian
 
-    def _integrated(self, samples: Samples, biases: F64) -> preintegration.Preintegrated:
+    def _integrated(
+        self, samples: Samples, biases: F64, failed: I64
+    ) -> preintegration.Preintegrated:
         data = inertial_data.InertialData(
             sample_start=starts_of_counts(np.array([len(times_ns) for times_ns, _ in samples])),
             timestamp_ns=np.concatenate([times_ns for times_ns, _ in samples], dtype=np.int64),
             accel_gyro=np.concatenate([values for _, values in samples], dtype=np.float64),
-            imus=(self._imu,),
-            imu_of_edge=np.zeros(len(samples), dtype=np.int64),
+            imus=self._imus,
+            imu_of_edge=failed,
         )
         return preintegration.integrate(data, biases[:, :3], biases[:, 3:])
 
@@ -188,7 +213,8 @@ class InertialChain:
     def _integrate(self, rows: I64, biases: F64) -> None:
         if not len(rows):
             return
-        measured = self._integrated([self._samples[row] for row in rows.tolist()], biases)
+        samples = [self._samples[row] for row in rows.tolist()]
+        measured = self._integrated(samples, biases, self._failed[rows])
         self._arguments[rows] = measured_arguments(measured, self._g_M)
         self._whitening[rows] = whitening(measured)
         self._integrated_at[rows] = self._seen_at[rows] = biases
@@ -199,3 +225,15 @@ class InertialChain:
         del self._samples[edge]
         for name in _COLUMNS:
             setattr(self, name, np.delete(getattr(self, name), edge, axis=0))
+
+
+def _with_failed(imu: Imu, parts: ImuPart) -> Imu:
+    """Return the IMU with the noise of some parts as large as that of a guess."""
+    changed: dict[str, float] = {}
+    if ImuPart.GYROSCOPE in parts:
+        changed["gyro_noise_density"] = _FAILED_RATE
+        changed["gyro_bias_random_walk_noise_density"] = _FAILED_WALK[0]
+    if ImuPart.ACCELEROMETER in parts:
+        changed["acc_noise_density"] = _FAILED_ACCELERATION
+        changed["acc_bias_random_walk_noise_density"] = _FAILED_WALK[1]
+    return dataclasses.replace(imu, **changed)  # type: ignore[arg-type]

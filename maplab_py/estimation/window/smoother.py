@@ -25,6 +25,7 @@ from maplab_py.estimation.window.cameras import BackProjection, CameraPoses
 from maplab_py.estimation.window.factors import FrameFactors, Standstill
 from maplab_py.estimation.window.frame import (
     FrameRows,
+    ImuPart,
     Motion,
     StartState,
     WindowFrame,
@@ -155,6 +156,10 @@ class FixedLagSmoother:
             stage_ms=self._stage_ms,
         )
 
+    def doubt_imu(self, since_ns: int, parts: ImuPart) -> None:
+        """Give next to no weight to the samples of failed parts of the IMU since a time."""
+        self._chain.doubt(since_ns, parts)
+
     def landmarks(self) -> tuple[I64, F64]:
         """Return track ids (L,) and places p_M (L, 3) of the landmarks in the window that are not too far."""
         rows = self.tracks.landmark_rows
@@ -215,7 +220,7 @@ class FixedLagSmoother:
             accel_gyro = np.concatenate([before, accel_gyro[1:]])
             self._drop_last()
         motion = self._states.motion[-1]
-        self._chain.append(times_ns, accel_gyro, motion, is_resting=is_resting)
+        self._chain.append(times_ns, accel_gyro, motion, is_resting=is_resting, failed=frame.failed)
         if is_resting:
             self._frames.is_resting[-1] = True
         T_M_I, new_motion = self._chain.predict(self._states.T_M_I[-1], motion)

@@ -42,6 +42,8 @@ from maplab_py.vision.tracking.views import CameraView, leaders, usable_alone
 
 _MIN_IN_PLANE_TURN_RAD = 0.01
 """From this turn about the optical axis on, the earlier image is turned with the camera."""
+_ENOUGH_TRACKS, _CONTRADICTED_SHARE = 20, 0.3
+"""When so small a share of so many tracks agrees with the given turn, it is looked for in the tracks."""
 _SAME_POINT_PX = 3.0
 """A track of a camera alone ends where a track of its leader arrives; none begins where another one is."""
 
@@ -52,6 +54,7 @@ class _CameraState:
 
     image: U8
     tracks: LiveTracks
+    shared: StereoMatches  # points of its leader
 
 
 class FrameTracker:
@@ -81,7 +84,7 @@ class FrameTracker:
             CameraView.of(camera, row, poses[row], self._options)
             for row, camera in enumerate(cameras)
         )
-        self._leaders = leaders(self._views)
+        self._leaders, self._absent = leaders(self._views), frozenset[int]()
         self._detectors = [self._detector(row) for row in range(len(cameras))]
         factor = self._options.image_resize_factor
         self._flow = FlowOptions(
@@ -98,6 +101,36 @@ class FrameTracker:
     def reset(self) -> None:
         """Forget all tracks; ids continue."""
         self._states = None
+
+    def leave_out(self, cameras: frozenset[int]) -> None:
+        """Look for nothing in the images of some cameras from now on, until another set is left out.
+
+        Cameras that have lost their leader follow the points that they shared with it.
+        """
+        if cameras == self._absent:
+            return
+        before, self._absent = self._leaders, cameras
+        self._leaders = leaders(self._views, cameras)
+        self._detectors = [self._detector(row) for row in range(len(self._views))]
+        states = list(self._states or ())
+        for row, state in enumerate(states):
+            tracks = state.tracks
+            if row in cameras:
+                tracks = LiveTracks.none()
+            elif before[row] != row and self._leaders[row] == row:
+                tracks = tracks.joined(self._alone(row, state))
+            states[row] = dataclasses.replace(state, tracks=tracks)
+        self._states = tuple(states) if states else None
+
+    def _alone(self, row: int, state: _CameraState) -> LiveTracks:
+        """Return the points that a camera shared with its leader as tracks of its own."""
+        shared = state.shared
+        ray, exists = self._views[row].rays(shared.uv)
+        tracks = LiveTracks.new(shared.uv[exists], ray[exists], 0)
+        tracks = dataclasses.replace(
+            tracks, track_id=shared.track_id[exists], num_frames=shared.num_frames[exists]
+        )
+        return tracks.compared_with(patches(state.image, tracks.uv), tracks.warp)
 
     def track(
         self, time_ns: int, images: tuple[U8, ...], R_I0_I1: F64 | None = None
@@ -128,6 +161,7 @@ class FrameTracker:
             live.append(tracks)
             motions += [motion] if motion is not None else []
         output: list[CameraTracks] = []
+        matches: list[StereoMatches] = []
         for row, image in enumerate(prepared):
             shared = StereoMatches.none()
             leader = self._leaders[row]
@@ -137,12 +171,12 @@ class FrameTracker:
                     live[leader], shared = self._shared(leader, row, pair, live[leader])
                     is_apart = are_apart(live[row].uv, shared.uv, _SAME_POINT_PX)
                     live[row] = live[row][is_apart]
-            with watch("detect"):
-                live[row] = self._with_new(row, image, live[row], shared)
+            if row not in self._absent:
+                with watch("detect"):
+                    live[row] = self._with_new(row, image, live[row], shared)
             output.append(self._output(row, shared, live[row]))
-        self._states = tuple(
-            _CameraState(image, tracks) for image, tracks in zip(prepared, live, strict=True)
-        )
+            matches.append(shared)
+        self._states = tuple(map(_CameraState, prepared, live, matches))
         disparity_px, is_turn_only = summarise(motions)
         return TrackedImages(
             time_ns,
@@ -188,15 +222,16 @@ class FrameTracker:
             ray, exists = view.rays(aligned.uv)
             rows = np.flatnonzero(is_tracked & exists & view.is_usable(aligned.uv))
         with watch("outliers"):
+            rays, limits = (tracks.ray[rows], ray[rows]), limits_of(self._options, view.focal_px)
+            recorded_px = view.preparation.to_recorded(aligned.uv[rows])
             motion = image_motion(
-                view.camera,
-                (tracks.ray[rows], ray[rows]),
-                view.preparation.to_recorded(aligned.uv[rows]),
-                R_C1_C0,
-                limits_of(self._options, view.focal_px),
-                seed,
+                view.camera, rays, recorded_px, R_C1_C0, limits, seed,
                 view.preparation.to_recorded(guess[rows]),
-            )
+            )  # fmt: skip
+            if len(rows) >= _ENOUGH_TRACKS and np.mean(motion.is_inlier) < _CONTRADICTED_SHARE:
+                free = image_motion(view.camera, rays, recorded_px, None, limits, seed)
+                if np.mean(free.is_inlier) > 1.0 - _CONTRADICTED_SHARE:
+                    motion = free  # the gyroscope is wrong, or the camera has been knocked
             rows = rows[motion.is_inlier]
         tracks = tracks.compared_with(aligned.patch, aligned.warp)[rows]
         return tracks.at(aligned.uv[rows], ray[rows]), motion

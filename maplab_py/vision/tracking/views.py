@@ -79,14 +79,15 @@ def focal_length_px(camera: Camera) -> float:
     return float(np.mean(camera.central_focal_px))
 
 
-def leaders(views: tuple[CameraView, ...]) -> list[int]:
+def leaders(views: tuple[CameraView, ...], absent: frozenset[int] = frozenset()) -> list[int]:
     """Return for each camera the camera whose tracks it takes over, itself if there is none.
 
-    It is the first camera that leads itself and sees enough of the image.
+    It is the first camera that leads itself and sees enough of the image. Absent ones lead nobody.
     """
     result: list[int] = []
     for row, view in enumerate(views):
-        candidates = (first for first in range(row) if result[first] == first)
+        earlier = (first for first in range(row) if result[first] == first)
+        candidates = [first for first in earlier if not {first, row} & absent]
         shared = (c for c in candidates if float(np.mean(seen_by(view, views[c]))) >= _MIN_OVERLAP)
         result.append(next(shared, row))
     return result

@@ -1,0 +1,355 @@
+"""Sensors that are left out: found by their signs, until they are whole again."""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+
+import numpy as np
+
+from maplab_py.array_types import F64, I64, U8
+from maplab_py.estimation.window.frame import ImuPart, WindowFrame
+from maplab_py.estimation.window.smoother import FixedLagSmoother
+from maplab_py.frontend.failures.images import ImageWatch
+from maplab_py.frontend.failures.motion import Disagreement, MotionComparison, Sighting
+from maplab_py.frontend.failures.samples import PARTS, SampleWatch
+from maplab_py.frontend.imu_buffer import ImuInterval
+from maplab_py.geometry import so3
+from maplab_py.interop.device import RecordedSensors
+from maplab_py.sensors import Imu
+from maplab_py.vimap.nav_state import NavState
+from maplab_py.vision.tracking.tracks import CameraTracks, TrackedImages
+
+_NAMES = {ImuPart.GYROSCOPE: "gyroscope", ImuPart.ACCELEROMETER: "accelerometer"}
+_FLOOR = {ImuPart.GYROSCOPE: 0.03, ImuPart.ACCELEROMETER: 0.3}
+"""Disagreements [rad/s], [m/s^2] that are no failure: of MH_01 none exceeds 0.016 and 0.14."""
+_FACTOR, _REMEMBERED, _FEWEST = 8.0, 40, 4
+"""A disagreement is above so many medians of those of the last ten seconds, of which there must be four. On
+Tango's map, whose shutter rolls, single ones reach nine and thirteen medians, never two in a row."""
+_IN_ROW = 2
+_WHOLE_IN_ROW = 5
+"""Comparisons that must agree with a constant bias until a part of the IMU is used again."""
+_MOST_RETURNS = 3
+_LOST_SHARE, _LOST_NS = 0.2, 600_000_000
+"""A camera that sees so small a share of the points of its leader, for so long, compared with before."""
+_MISFIT_RAD = 0.01
+"""Points of a camera are so far from where those of all cameras are seen."""
+_SHIFTED = "its points do not fit: shifted on its mounting?"
+
+
+@dataclasses.dataclass
+class SensorFailure:
+    """A sensor that is left out."""
+
+    sensor: str
+    reason: str
+    since_ns: int
+    found_ns: int
+    until_ns: int = 0  # 0 = to the end
+    is_used: bool = False  # for want of another
+
+    def words(self, zero_ns: int) -> str:
+        """Return what has happened, in seconds after a time."""
+        since_s, until_s = (1e-9 * (t - zero_ns) for t in (self.since_ns, self.until_ns))
+        end = f"to {until_s:.1f} s" if self.until_ns else "on"
+        fate = "used for want of another" if self.is_used else "left out"
+        return f"{self.sensor} {fate} from {since_s:.1f} s {end}: {self.reason}"
+
+
+class SensorWatch:
+    """Watches cameras and IMU of a running odometry.
+
+    Attributes:
+        failures: All of them, the earliest first.
+    """
+
+    def __init__(self, device: RecordedSensors, imu: Imu) -> None:
+        """Watch the sensors of a device; nothing has failed."""
+        self._device, self._imu = device, imu
+        self._count = len(device.cameras)
+        self._images = [ImageWatch() for _ in device.cameras]
+        self._samples = SampleWatch()
+        self.failures: list[SensorFailure] = []
+        self._open: dict[str, SensorFailure] = {}
+        self._last_motion = _StateMotion(np.zeros(3), np.zeros(3))
+        self._returns = 0
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the motion; the estimator starts again."""
+        self._comparison = MotionComparison(self._device, self._imu)
+        self._usual = {part: _Usual() for part in PARTS}
+        self._shares: collections.deque[float] = collections.deque(maxlen=_REMEMBERED)
+        self._lost_since_ns = 0
+        for name in [name for name in self._open if not name.startswith("camera")]:
+            self._open.pop(name)
+
+    @property
+    def left_out(self) -> frozenset[int]:
+        """Rows of the cameras that are left out."""
+        failures = (self._open.get(f"camera {row}") for row in range(self._count))
+        return frozenset(
+            row for row, each in enumerate(failures) if each is not None and not each.is_used
+        )
+
+    @property
+    def failed(self) -> ImuPart:
+        """Parts of the IMU that are left out."""
+        result = ImuPart(0)
+        for part, name in _NAMES.items():
+            result |= part if name in self._open else ImuPart(0)
+        return result
+
+    def status(self) -> str:
+        """Return what is left out now."""
+        return "; ".join(f"{f.sensor} left out: {f.reason}" for f in self._open.values())
+
+    def has_failed_between(self, from_ns: int, to_ns: int) -> bool:
+        """Tell whether any sensor was left out at some time of an interval."""
+        return any(_was_out(each, from_ns, to_ns) for each in self.failures)
+
+    def failed_between(self, from_ns: int, to_ns: int) -> ImuPart:
+        """Return the parts of the IMU that were left out at some time of an interval."""
+        result = ImuPart(0)
+        for part, name in _NAMES.items():
+            of_part = (each for each in self.failures if each.sensor == name)
+            if any(_was_out(each, from_ns, to_ns) for each in of_part):
+                result |= part
+        return result
+
+    # -- samples ----------------------------------------------------------------------------------
+
+    def usable(
+        self, interval: ImuInterval, smoother: FixedLagSmoother | None
+    ) -> tuple[ImuInterval, ImuPart]:
+        """Return an interval whose failed parts measure a constant velocity, and these parts."""
+        self._samples.push(interval.times_ns[1:-1], interval.accel_gyro[1:-1])
+        if smoother is None:
+            return interval, ImuPart(0)
+        now_ns = int(interval.times_ns[-1])
+        for part, name in _NAMES.items():
+            if part in self._samples.signs and name not in self._open:
+                axes, since_ns = self._samples.signs[part]
+                self._fail(name, axes, since_ns, now_ns)
+                smoother.doubt_imu(since_ns, part)
+            elif name in self._open and part not in self._samples.signs:
+                failure = self._open[name]
+                if not failure.reason.startswith("it "):  # the samples themselves said so
+                    self._return(name, now_ns)
+        if not self.failed:
+            return interval, ImuPart(0)
+        samples = interval.accel_gyro.copy()
+        if ImuPart.GYROSCOPE in self.failed:
+            samples[:, 3:] = self._last_motion.rate_I + smoother.states.motion[-1, 3:6]
+        if ImuPart.ACCELEROMETER in self.failed:
+            samples[:, :3] = self._last_motion.force_I + smoother.states.motion[-1, 6:]
+        return dataclasses.replace(interval, accel_gyro=samples), self.failed
+
+    # -- images -----------------------------------------------------------------------------------
+
+    def look(self, time_ns: int, images: tuple[U8, ...], *, is_moving: bool) -> None:
+        """Look at the images of a frame."""
+        for row, image in enumerate(images):
+            watch, name = self._images[row], f"camera {row}"
+            watch.push(time_ns, image, is_moving=is_moving)
+            is_only = len(self.left_out | {row}) == self._count
+            if watch.sign and name not in self._open:
+                self._fail(name, watch.sign, watch.since_ns, time_ns)
+                # a blurred image is better than none
+                self._open[name].is_used = is_only and watch.sign == "out of focus"
+            elif not watch.sign and name in self._open and self._open[name].reason != _SHIFTED:
+                self._return(name, time_ns)
+
+    def without_failed(self, tracked: TrackedImages) -> TrackedImages:
+        """Return tracks without those of cameras that are left out."""
+        if not self.left_out:
+            return tracked
+        cameras = tuple(
+            CameraTracks.empty() if row in self.left_out else tracks
+            for row, tracks in enumerate(tracked.cameras)
+        )
+        return dataclasses.replace(tracked, cameras=cameras)
+
+    def _count_shared(self, time_ns: int, frame: WindowFrame) -> None:
+        """Find a second camera that has lost the points of the first."""
+        if self._count != 2 or self.left_out:
+            self._lost_since_ns = 0
+            return
+        ids = [frame.track_id[frame.camera == row] for row in range(2)]
+        if not len(ids[0]):
+            return
+        share = float(np.mean(np.isin(ids[0], ids[1])))
+        is_lost = len(self._shares) >= 10 and share < _LOST_SHARE * float(np.median(self._shares))
+        if not is_lost:
+            self._shares.append(share)
+            self._lost_since_ns = 0
+        elif not self._lost_since_ns:
+            self._lost_since_ns = time_ns
+        elif time_ns - self._lost_since_ns > _LOST_NS:
+            self._fail("camera 1", _SHIFTED, self._lost_since_ns, time_ns)
+
+    # -- motion -----------------------------------------------------------------------------------
+
+    def compare(
+        self, frame: WindowFrame, interval: ImuInterval, smoother: FixedLagSmoother
+    ) -> None:
+        """Compare the samples and the cameras with the motion that the images show.
+
+        Args:
+            frame: The newest frame.
+            interval: Its samples as measured.
+            smoother: The window after it.
+        """
+        self._last_motion = _motion_of(smoother, self._imu)
+        self._comparison.push(
+            Sighting(
+                frame.time_ns, frame.camera, frame.track_id, frame.uv_px,
+                interval.times_ns, interval.accel_gyro,
+            )
+        )  # fmt: skip
+        self._count_shared(frame.time_ns, frame)
+        if not self._comparison.is_due(frame.time_ns):
+            return
+        cameras = frozenset(range(self._count)) - self.left_out
+        disagreement = self._comparison.compared(cameras) if cameras else None
+        if disagreement is not None:
+            shifted = self._shifted_camera(disagreement, cameras, frame.time_ns)
+            if shifted is None:
+                self._judge(disagreement, frame.time_ns, smoother)
+        states = smoother.states
+        biases = states.motion[-1, 3:6], states.motion[-1, 6:]
+        self._comparison.remember(smoother.landmarks(), states.T_M_I[-1], biases)
+
+    def _shifted_camera(
+        self, joint: Disagreement, cameras: frozenset[int], now_ns: int
+    ) -> int | None:
+        """Find the camera of several that alone contradicts the IMU; leave it out."""
+        if len(cameras) < 2 or not (
+            np.nanmax(joint.fit_rad) > _MISFIT_RAD or self._is_unusual(joint)
+        ):
+            return None
+        alone = {row: self._comparison.compared(frozenset([row])) for row in cameras}
+        right = [r for r, each in alone.items() if each is not None and not self._is_unusual(each)]
+        wrong = [r for r, each in alone.items() if each is not None and self._is_unusual(each)]
+        if len(right) == 0 or len(wrong) != 1:
+            return None
+        self._fail(f"camera {wrong[0]}", _SHIFTED, joint.since_ns, now_ns)
+        return wrong[0]
+
+    def _is_unusual(self, disagreement: Disagreement) -> bool:
+        return any(self._usual[part].excess(part, _of(disagreement, part)) > 1.0 for part in PARTS)
+
+    def _judge(self, new: Disagreement, now_ns: int, smoother: FixedLagSmoother) -> None:
+        """Leave parts of the IMU out, or take them back."""
+        for part in (ImuPart.GYROSCOPE, ImuPart.ACCELEROMETER):
+            name, usual, error = _NAMES[part], self._usual[part], _of(new, part)
+            failure = self._open.get(name)
+            if failure is None:
+                excess = usual.add(part, error)
+                if part is ImuPart.GYROSCOPE and excess > 1.0:
+                    usual_of_other = self._usual[ImuPart.ACCELEROMETER]
+                    usual_of_other.in_row = 0  # gravity would be turned by the wrong rates
+                if usual.in_row >= _IN_ROW:
+                    unit = "rad/s" if part is ImuPart.GYROSCOPE else "m/s^2"
+                    size = float(np.linalg.norm(error - usual.bias))
+                    reason = f"it differs by {size:.2g} {unit} from the motion of the images"
+                    self._fail(name, reason, usual.since_ns, now_ns)
+                    smoother.doubt_imu(usual.since_ns, part)
+                    usual.recent.clear()
+                if excess > 1.0:
+                    return
+                usual.since_ns = new.since_ns
+            elif failure.reason.startswith("it "):
+                usual.recent.append(error)
+                if usual.agrees_with_a_bias(part) and self._returns < _MOST_RETURNS:
+                    usual.bias = np.mean(usual.recent, axis=0)
+                    self._returns += 1
+                    self._return(name, now_ns)
+                elif part is ImuPart.GYROSCOPE:
+                    return
+
+    def _fail(self, name: str, reason: str, since_ns: int, found_ns: int) -> None:
+        failure = SensorFailure(name, reason, since_ns, found_ns)
+        self._open[name] = failure
+        self.failures.append(failure)
+
+    def _return(self, name: str, now_ns: int) -> None:
+        self._open.pop(name).until_ns = now_ns
+
+
+def _was_out(failure: SensorFailure, from_ns: int, to_ns: int) -> bool:
+    return failure.since_ns < to_ns and not 0 < failure.until_ns <= from_ns
+
+
+class _Usual:
+    """Disagreements of a part of the IMU while it is whole."""
+
+    def __init__(self) -> None:
+        self._sizes: collections.deque[float] = collections.deque(maxlen=_REMEMBERED)
+        self.recent: collections.deque[F64] = collections.deque(maxlen=_WHOLE_IN_ROW)
+        self.bias: F64 = np.zeros(3)  # with which it has come back
+        self.in_row, self.since_ns = 0, 0
+
+    def excess(self, part: ImuPart, error: F64) -> float:
+        """Return the size of an error as a multiple of what is possible; 0 while nothing is known."""
+        if len(self._sizes) < _FEWEST:
+            return 0.0
+        return float(np.linalg.norm(error - self.bias)) / self._limit(part)
+
+    def add(self, part: ImuPart, error: F64) -> float:
+        """Take an error; return it as a multiple of what is possible."""
+        excess = self.excess(part, error)
+        self.in_row = self.in_row + 1 if excess > 1.0 else 0
+        if not self.in_row:
+            self._sizes.append(float(np.linalg.norm(error - self.bias)))
+        return excess
+
+    def agrees_with_a_bias(self, part: ImuPart) -> bool:
+        """Tell whether the newest errors are the same."""
+        if len(self.recent) < _WHOLE_IN_ROW:
+            return False
+        spread = np.linalg.norm(self.recent - np.mean(self.recent, axis=0), axis=1)
+        return bool(spread.max() < 0.5 * self._limit(part))
+
+    def _limit(self, part: ImuPart) -> float:
+        return max(_FLOOR[part], _FACTOR * float(np.median(self._sizes)))
+
+
+def _of(disagreement: Disagreement, part: ImuPart) -> F64:
+    return disagreement.rate if part is ImuPart.GYROSCOPE else disagreement.acceleration
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _StateMotion:
+    """Constant velocity, as an IMU without biases would measure it."""
+
+    rate_I: F64  # (3,)
+    force_I: F64  # (3,)
+
+
+def _motion_of(smoother: FixedLagSmoother, imu: Imu) -> _StateMotion:
+    """Return the motion between the two newest frames of a window."""
+    T_M_I, times_ns = smoother.states.T_M_I[-2:], smoother.times_ns[-2:]
+    force_I = so3.rotate(
+        so3.inverse(T_M_I[-1, :4]), np.array([0.0, 0.0, imu.gravity_magnitude_mps2])
+    )
+    if len(times_ns) < 2:
+        return _StateMotion(np.zeros(3), force_I)
+    turned = so3.log(so3.multiply(so3.inverse(T_M_I[0, :4]), T_M_I[1, :4]))
+    return _StateMotion(turned / (1e-9 * float(times_ns[1] - times_ns[0])), force_I)
+
+
+def replaced(
+    times_ns: I64, accel_gyro: F64, parts: ImuPart, ends: NavState, gravity_mps2: float
+) -> F64:
+    """Return samples (S, 6) of an interval whose failed parts are those that lead from state to state."""
+    dt = 1e-9 * float(times_ns[-1] - times_ns[0])
+    result, q = accel_gyro.copy(), ends.T_M_I[:, :4]
+    if ImuPart.GYROSCOPE in parts:
+        turned = so3.log(so3.multiply(so3.inverse(q[0]), q[1]))
+        result[:, 3:] = turned / dt + ends.gyro_bias[0]
+    if ImuPart.ACCELEROMETER in parts:
+        acceleration = (ends.v_M[1] - ends.v_M[0]) / dt + np.array([0.0, 0.0, gravity_mps2])
+        middle = so3.multiply(q[0], so3.exp(0.5 * so3.log(so3.multiply(so3.inverse(q[0]), q[1]))))
+        result[:, :3] = so3.rotate(so3.inverse(middle), acceleration) + ends.accel_bias[0]
+    return result
