@@ -270,12 +270,9 @@ class Odometry:
         motion = Motion.MOVING
         if interval is not None:
             motion = self._detector.classify(
-                interval,
-                tracked,
-                turn_rad=self._turn_rad(interval),
-                speed_mps=self._speed_mps,
+                interval, tracked, turn_rad=self._turn_rad(interval), speed_mps=self._speed_mps,
                 visible_mps=self._visible_mps(),
-            )
+            )  # fmt: skip
             if failed and motion is Motion.RESTING:
                 motion = Motion.MOVING
         update = OdometryUpdate(
@@ -346,18 +343,13 @@ class Odometry:
         self, frame_set: FrameSet | TrackedFrameSet, interval: ImuInterval | None, failed: ImuPart
     ) -> tuple[TrackedImages, tuple[U8, ...]]:
         """Return the tracks of a frame set, and its images if it has some."""
-        R_I0_I1 = None
-        if interval is not None and ImuPart.GYROSCOPE not in failed:
-            R_I0_I1 = turn(self._imu, interval, self._gyro_bias)
+        has_turn = interval is not None and ImuPart.GYROSCOPE not in failed
+        R_I0_I1 = turn(self._imu, interval, self._gyro_bias) if interval and has_turn else None
         if isinstance(frame_set, TrackedFrameSet):
             self._replayed = tracked_images_of(
-                frame_set,
-                self._replayed,
-                self._device.cameras,
-                self._device.T_I_C,
-                R_I0_I1,
+                frame_set, self._replayed, self._device.cameras, self._device.T_I_C, R_I0_I1,
                 self.options.tracking,
-            )
+            )  # fmt: skip
             return self._replayed, ()
         begin = time.perf_counter()
         images = tuple(image.grey() for image in frame_set.images)

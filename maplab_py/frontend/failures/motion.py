@@ -12,7 +12,7 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I32, I64, Mask
 from maplab_py.estimation.imu.inertial_data import InertialData
 from maplab_py.estimation.imu.preintegration import Preintegrated, integrate
 from maplab_py.geometry import se3, so3
@@ -34,7 +34,7 @@ class Sighting:
     """Keypoints of a frame, and the samples that lead to it."""
 
     time_ns: int
-    camera: I64  # (K,)
+    camera: I32  # (K,)
     track_id: I64  # (K,)
     uv_px: F64  # (K, 2)
     times_ns: I64  # (S,)

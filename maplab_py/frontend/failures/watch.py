@@ -339,6 +339,15 @@ def _motion_of(smoother: FixedLagSmoother, imu: Imu) -> _StateMotion:
     return _StateMotion(turned / (1e-9 * float(times_ns[1] - times_ns[0])), force_I)
 
 
+def with_biases_of(whole: NavState, state: NavState, parts: ImuPart) -> NavState:
+    """Return a state with the biases of another one for parts of the IMU that have failed."""
+    return dataclasses.replace(
+        state,
+        gyro_bias=whole.gyro_bias if ImuPart.GYROSCOPE in parts else state.gyro_bias,
+        accel_bias=whole.accel_bias if ImuPart.ACCELEROMETER in parts else state.accel_bias,
+    )
+
+
 def replaced(
     times_ns: I64, accel_gyro: F64, parts: ImuPart, ends: NavState, gravity_mps2: float
 ) -> F64:
