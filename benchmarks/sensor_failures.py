@@ -58,7 +58,7 @@ def measure(folder: Path, rows: str, kind: str, seed: int, truth: Trajectory, ze
     camera = seed % len(recording.device.cameras)
     mapping, problem = _run(failing(recording, kind, from_ns, camera=camera))
     failures, sensor = mapping.odometry.watch.failures, kind.split(maxsplit=1)[0]
-    after_s = min((1e-9 * (f.found_ns - from_ns) for f in failures), default=float("nan"))
+    after_s = min((1e-9 * (f.detected_ns - from_ns) for f in failures), default=float("nan"))
     is_right = bool(failures) and failures[0].sensor.startswith(sensor)
     away_m = _distance_m(truth, mapping)
     reasons = [start.reason for start in mapping.statistics.starts[1:]]

@@ -74,16 +74,18 @@ def failing(
     return dataclasses.replace(plain, edit_samples=edited)
 
 
-def _covered(pixels: Pixels) -> Pixels:
+def covered(pixels: Pixels) -> Pixels:
+    """Return what a covered camera sees."""
     noise = np.random.default_rng(int(pixels.sum(dtype=np.int64))).normal(6.0, 1.5, pixels.shape)
     return np.clip(noise, 0.0, 255.0).astype(np.uint8)
 
 
-def _blurred(pixels: Pixels) -> Pixels:
+def blurred(pixels: Pixels) -> Pixels:
+    """Return what a camera out of focus sees."""
     return np.asarray(cv2.GaussianBlur(pixels, (0, 0), 4.0))
 
 
-_PIXELS: dict[str, Edit] = {"covered": _covered, "out of focus": _blurred}
+_PIXELS: dict[str, Edit] = {"covered": covered, "out of focus": blurred}
 _SHIFT_DEG = (1.2, -1.2, 1.0)
 
 

@@ -110,10 +110,10 @@ class MotionComparison:
         poses = []
         T_M_I, fit = snapshot.T_M_I, np.zeros(0)
         for frame in (span[0], span[middle], span[-1]):
-            found = self._pose(frame, snapshot, T_M_I, cameras)
-            if found is None:
+            pose = self._pose(frame, snapshot, T_M_I, cameras)
+            if pose is None:
                 return None
-            T_M_I, fit = found
+            T_M_I, fit = pose
             poses.append(T_M_I)
         legs = self._integrated([span[1 : middle + 1], span[middle + 1 :]], snapshot.biases)
         return _compare(np.array(poses), legs, self._imu, snapshot.time_ns, fit)

@@ -44,7 +44,7 @@ class SensorFailure:
     sensor: str
     reason: str
     since_ns: int
-    found_ns: int
+    detected_ns: int
     until_ns: int = 0  # 0 = to the end
     is_used: bool = False  # for want of another
 
@@ -268,8 +268,8 @@ class SensorWatch:
                 elif part is ImuPart.GYROSCOPE:
                     return
 
-    def _fail(self, name: str, reason: str, since_ns: int, found_ns: int) -> None:
-        failure = SensorFailure(name, reason, since_ns, found_ns)
+    def _fail(self, name: str, reason: str, since_ns: int, detected_ns: int) -> None:
+        failure = SensorFailure(name, reason, since_ns, detected_ns)
         self._open[name] = failure
         self.failures.append(failure)
 

@@ -43,7 +43,7 @@ from maplab_py.vision.tracking.views import CameraView, leaders, usable_alone
 _MIN_IN_PLANE_TURN_RAD = 0.01
 """From this turn about the optical axis on, the earlier image is turned with the camera."""
 _ENOUGH_TRACKS, _CONTRADICTED_SHARE = 20, 0.3
-"""When so small a share of so many tracks agrees with the given turn, it is looked for in the tracks."""
+"""The turn is looked for in the tracks when so small a share of so many of them agrees with the given one."""
 _SAME_POINT_PX = 3.0
 """A track of a camera alone ends where a track of its leader arrives; none begins where another one is."""
 

@@ -18,7 +18,7 @@ from maplab_py.frontend.run_options import RunOptions
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.recordings.map_replay import MapRecording
 from maplab_py.vimap.nav_state import NavState
-from tests.frontend.failing import _blurred, _covered, failing
+from tests.frontend.failing import blurred, covered, failing
 from tests.frontend.known_start import KnownStart
 from tests.frontend.simulated import REST_FIRST, position_errors, replayed
 
@@ -42,7 +42,7 @@ def test_signs_of_images_come_and_go(sign: str) -> None:
     for k, image in enumerate(_images(120)):
         shown = image
         if 40 <= k < 80:
-            edits = {"covered": _covered, "out of focus": _blurred, "frozen": lambda _: frozen}
+            edits = {"covered": covered, "out of focus": blurred, "frozen": lambda _: frozen}
             shown = edits[sign](image) if sign else image
         watch.push(k * _FRAME_NS, shown, is_moving=True)
         told.append(watch.sign)
@@ -125,11 +125,11 @@ def test_an_imu_that_fails_does_not_bend_the_map(kind: str) -> None:
     assert errors[-10:].max() < 0.03  # also where it was wrong until the failure was found
     if not kind:
         return
-    assert 0 < failures[0].found_ns - from_ns < 3_000_000_000
+    assert 0 < failures[0].detected_ns - from_ns < 3_000_000_000
     assert "it differs by" in failures[0].words(0)
     assert mapping.builder is not None
     samples = mapping.builder.make_map().imu_samples
-    after = samples.timestamp_ns > failures[0].found_ns + 200_000_000
+    after = samples.timestamp_ns > failures[0].detected_ns + 200_000_000
     after &= samples.timestamp_ns < (failures[0].until_ns or truth.times_ns[-1])
     column, offset = (5, 0.1) if "gyro" in kind else (2, 0.6)
     given = np.interp(
