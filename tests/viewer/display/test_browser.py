@@ -118,16 +118,6 @@ def test_the_page_shows_the_map_and_asks_nobody_else(page: Page, viewer: Viewer)
     assert page.page.get_by_text("1 mission").count() == 1
 
 
-def test_the_space_bar_plays_and_pauses(shared_page: Page, viewer: Viewer) -> None:
-    page, time_line = shared_page, viewer.playback.time_line
-    viewer.playback.configure(PlaybackOptions(steps=40, vertex_frequency=0.5))
-    page.page.keyboard.press("Space")
-    assert page.wait_until(lambda: time_line.is_playing)
-    page.page.keyboard.press("Space")
-    assert page.wait_until(lambda: not time_line.is_playing)
-    assert viewer.player is not None
-
-
 def test_checkboxes_toggle_layers(page: Page, viewer: Viewer) -> None:
     before = page.still_picture()
     page.click(page.checkbox("Landmarks 300"))
