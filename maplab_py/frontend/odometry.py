@@ -401,10 +401,9 @@ class Odometry:
 
     def _started(self, start: Start) -> NavState:
         """Start the smoother, and add the frames that have come since; return the newest state."""
-        first, state = start.frame, start.state
         smoother = self._new_smoother()
-        smoother.start(first, state)
-        newest: NavState = state
+        smoother.start(start.frame, start.state)
+        newest: NavState = start.state
         later = []
         for frame in start.later:
             # without biases and speed, turning and resting could not be told apart

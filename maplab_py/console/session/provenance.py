@@ -97,8 +97,6 @@ class Provenance:
         Raises:
             OSError: One cannot be written.
         """
-        from maplab_py.console.session.cards import write_card
-
         known = {id(entry.disk_copy) for entry in base.entries.values()}
         for entry in result.entries.values():
             copy, script = entry.disk_copy, self.script_of(entry)
@@ -108,6 +106,8 @@ class Provenance:
             read = {Path(given.path).resolve() for given in script[-1].inputs}
             if not copy.fingerprint or not read.isdisjoint((copy.folder, *copy.folder.parents)):
                 continue  # it was loaded
+            from maplab_py.console.session.cards import write_card  # with the libraries of saving
+
             outputs = tuple(dict.fromkeys(path for line in script for path in line.outputs))
             write_card(entry, script_text(script), inputs, outputs, accuracy_of(entry))
 

@@ -40,6 +40,7 @@ from maplab_py.interop.recordings.clocks import (
     dropped_note,
     first_stamp_ns,
     follows,
+    is_within,
     restart_error,
 )
 from maplab_py.interop.recordings.images import bits_note, camera_bits, image_of_message
@@ -293,7 +294,7 @@ class BagRecording:
                         return
                     raise restart_error(f"{self._path}: {stream.topic}", clock.restart)
             for time_ns, content in ready:
-                if not self._is_within(time_ns, start_ns, end_ns):
+                if not is_within(time_ns, start_ns, end_ns):
                     continue
                 if is_image:
                     yield time_ns, stream, reader.deserialize(content[1], content[0])
@@ -318,20 +319,15 @@ class BagRecording:
         """Return the messages that are in line after one out of line; those left out of a span count."""
         dropped = clock.dropped
         ready = clock.push(stamp_ns + stream.time_offset_ns, message)
-        if clock.dropped > dropped and not self._is_within(stamp_ns, *span_ns):
+        if clock.dropped > dropped and not is_within(stamp_ns, *span_ns):
             clock.dropped = dropped
         elif clock.dropped > dropped:
             self._check_late(stream, clock)
         return ready
 
-    @staticmethod
-    def _is_within(time_ns: int, start_ns: int | None, end_ns: int | None) -> bool:
-        return (start_ns is None or time_ns >= start_ns) and (end_ns is None or time_ns < end_ns)
-
     def _stamp_ns(self, data: bytes, arrival_ns: int, *, is_ros_2: bool) -> int:
-        if self._reading.use_arrival_time:
-            return arrival_ns
-        return header_stamp_ns(data, is_ros_2=is_ros_2)
+        is_stamped = not self._reading.use_arrival_time
+        return header_stamp_ns(data, is_ros_2=is_ros_2) if is_stamped else arrival_ns
 
     def _check_late(self, stream: TopicStream, clock: ClockFilter[Any]) -> None:
         check_dropped(
@@ -497,7 +493,6 @@ class BagRecording:
 
     def _image(self, stream: TopicStream, time_ns: int, message: Any, bits: int) -> CameraImage:
         stamp_ns = time_ns - stream.time_offset_ns
-        camera = self.device.cameras[stream.camera]
-        name = f"{self._path}: {stream.topic} at {stamp_ns}"
-        data = image_of_message(message, name, camera)
-        return CameraImage(stream.camera, time_ns, stamp_ns, data, bits)
+        name, camera = f"{self._path}: {stream.topic} at {stamp_ns}", stream.camera
+        data = image_of_message(message, name, self.device.cameras[camera])
+        return CameraImage(camera, time_ns, stamp_ns, data, bits)

@@ -112,6 +112,11 @@ class ClockFilter(Generic[T]):
         self._waiting = []
 
 
+def is_within(time_ns: int, start_ns: int | None, end_ns: int | None) -> bool:
+    """Return whether a time lies in a half-open span; None = no bound."""
+    return (start_ns is None or time_ns >= start_ns) and (end_ns is None or time_ns < end_ns)
+
+
 def follows(before_ns: int, stamp_ns: int) -> bool:
     """Return whether a stamp comes after another, of the same clock."""
     return 0 < stamp_ns - before_ns <= _LARGEST_STEP_NS
