@@ -86,7 +86,7 @@ def merge_landmarks(vi_map: VIMap, from_rows: ArrayLike, into_rows: ArrayLike) -
         raise ValueError(f"{len(source)} landmarks cannot merge into {len(target)}")
     count = len(vi_map.landmarks)
     as_rows(np.concatenate([source, target]), count)  # range check
-    survivor = _survivors(source, target, count)
+    survivor = survivors(source, target, count)
     absorbed = survivor != np.arange(count)
     if not absorbed.any():
         return vi_map
@@ -105,8 +105,8 @@ def merge_landmarks(vi_map: VIMap, from_rows: ArrayLike, into_rows: ArrayLike) -
     return keep_rows(merged, landmarks=np.flatnonzero(~absorbed))
 
 
-def _survivors(source: I64, target: I64, count: int) -> I64:
-    """Return the row (count,) that each landmark ends up in."""
+def survivors(source: I64, target: I64, count: int) -> I64:
+    """Return the row (count,) that each landmark ends up in when `merge_landmarks` merges pairs (N,)."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

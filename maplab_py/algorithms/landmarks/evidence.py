@@ -27,10 +27,7 @@ RECORD = np.dtype(
         ("time_s", "<u4"),  # begin of the last session that is summarised
         ("hits", "<u2"),  # summarised sessions in which it was matched
         ("misses", "<u2"),  # and in which it was predicted only
-        (
-            "vanished",
-            "<f4",
-        ),  # log probability of these sessions and of having vanished before the last
+        ("vanished", "<f4"),  # log probability of these and of having vanished before the last
         ("recent", _ENTRY, (RECENT,)),  # the oldest first; time_s 0 = none
     ]
 )
@@ -102,13 +99,17 @@ def has_evidence(vi_map: VIMap) -> bool:
 
 
 def add_session(evidence: NDArray[Any], session: Session) -> tuple[NDArray[Any], Mask]:
-    """Add a session; places of a session that is known already are united.
+    """Add a session in the order of time; places of a session that is known already are united.
+
+    A session that may be part of a summary, or is older than all sessions of a full record, is left out.
 
     Returns:
         The evidence, and the records (L,) that are full: their oldest session must be summarised first.
     """
     evidence = evidence.copy()
     recent = evidence["recent"]
+    counts = session.time_s > evidence["time_s"][session.landmark]
+    session = session.take(counts & (session.time_s >= recent["time_s"][session.landmark, 0]))
     rows = session.landmark
     same = recent["time_s"][rows] == session.time_s
     known = same.any(axis=1)
@@ -123,14 +124,22 @@ def add_session(evidence: NDArray[Any], session: Session) -> tuple[NDArray[Any],
     for name, values in (("predicted", session.predicted), ("matched", session.matched)):
         old = recent[name][rows[known], column]
         recent[name][rows[known], column] = np.maximum(old, np.minimum(values[known], 255))
-    evidence["recent"] = recent
+    evidence["recent"] = _in_order(recent)
     return evidence, full
+
+
+def with_inherited(vi_map: VIMap, absorbed: I64, survivor: I64) -> VIMap:
+    """Return the map in which survivors (N,) have the evidence of absorbed landmarks (N,), too."""
+    if len(absorbed) == 0 or not has_evidence(vi_map):
+        return vi_map
+    return with_evidence(vi_map, inherit(read_evidence(vi_map), absorbed, survivor))
 
 
 def inherit(evidence: NDArray[Any], absorbed: I64, survivor: I64) -> NDArray[Any]:
     """Return the evidence (L,) after landmarks (N,) were merged into others (N,).
 
-    The survivor inherits both histories: a session in which either was matched counts as matched.
+    The survivor inherits both histories: a session in which either was matched counts as matched. Summaries
+    may hold the same sessions: that with more matches stays, and no session of its period is added to it.
     """
     evidence = evidence.copy()
     wanted = evidence["born_s"][absorbed] > 0
@@ -145,30 +154,27 @@ def inherit(evidence: NDArray[Any], absorbed: I64, survivor: I64) -> NDArray[Any
 
 def _united(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
     """Return the histories (N,) of two records each as one."""
+    sessions = [record["hits"].astype(np.int64) + record["misses"] for record in (a, b)]
+    is_better = (b["hits"] > a["hits"]) | ((b["hits"] == a["hits"]) & (sessions[1] > sessions[0]))
+    result = np.where(is_better, b, a)
     is_new = a["born_s"] == 0
-    result = a.copy()
     result["born_s"] = np.where(is_new, b["born_s"], np.minimum(a["born_s"], b["born_s"]))
-    for name in ("hits", "misses"):
-        result[name] = np.minimum(a[name].astype(np.int64) + b[name], 65535)
-    result["time_s"] = np.maximum(a["time_s"], b["time_s"])
-    result["vanished"] = np.maximum(np.maximum(a["vanished"] + b["vanished"], NEVER), NEVER)
-    only = (a["vanished"] <= NEVER) | (b["vanished"] <= NEVER)
-    result["vanished"] = np.where(
-        only, np.maximum(a["vanished"], b["vanished"]), result["vanished"]
-    )
-    entries = np.concatenate([a["recent"], b["recent"]], axis=1)
-    order = np.argsort(entries["time_s"], axis=1, kind="stable")
-    entries = np.take_along_axis(entries, order, axis=1)
+    entries = _in_order(np.concatenate([a["recent"], b["recent"]], axis=1))
+    times = entries["time_s"]
+    same = (times[:, 1:] == times[:, :-1]) & (times[:, 1:] > 0)
     for name in ("predicted", "matched"):  # of equal times the later one gets both
-        same = (np.diff(entries["time_s"].astype(np.int64), axis=1) == 0) & (
-            entries["time_s"][:, 1:] > 0
-        )
         both = np.maximum(entries[name][:, 1:], entries[name][:, :-1])
         entries[name][:, 1:] = np.where(same, both, entries[name][:, 1:])
-    entries["time_s"][:, :-1][same] = 0
-    order = np.argsort(entries["time_s"], axis=1, kind="stable")
-    result["recent"] = np.take_along_axis(entries, order, axis=1)[:, -RECENT:]
+    times[:, :-1][same] = 0
+    times[times <= result["time_s"][:, None]] = 0
+    result["recent"] = _in_order(entries)[:, -RECENT:]
     return result
+
+
+def _in_order(entries: NDArray[Any]) -> NDArray[Any]:
+    """Return the sessions of records (L, N) in the order of time."""
+    order = np.argsort(entries["time_s"], axis=1, kind="stable")
+    return np.take_along_axis(entries, order, axis=1)
 
 
 def birth_times_s(vi_map: VIMap) -> I64:

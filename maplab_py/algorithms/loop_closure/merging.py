@@ -4,12 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.algorithms.landmarks.evidence import (
-    has_evidence,
-    inherit,
-    read_evidence,
-    with_evidence,
-)
+from maplab_py.algorithms.landmarks.evidence import with_inherited
 from maplab_py.algorithms.landmarks.keypoint_rays import landmark_covariance
 from maplab_py.algorithms.landmarks.quality import predicted_sigma
 from maplab_py.algorithms.landmarks.triangulation import triangulate_keypoints
@@ -120,7 +115,7 @@ def _merge(
     counts = {FEW_OBSERVATIONS: united.too_few, SAME_IMAGE: united.seen_together}
     refused |= {reason: count for reason, count in counts.items() if count}
     absorbed, survivor = _into_best(vi_map, united.first, united.second)
-    merged = merge_landmarks(_with_both_histories(vi_map, absorbed, survivor), absorbed, survivor)
+    merged = merge_landmarks(with_inherited(vi_map, absorbed, survivor), absorbed, survivor)
     ids = vi_map.landmarks.id[np.unique(survivor)]
     return _triangulate(merged, merged.landmark_index.rows(ids)), MergeResult(
         landmarks_merged=len(vi_map.landmarks) - len(merged.landmarks),
@@ -131,13 +126,6 @@ def _merge(
         closure=closure[rows[united.vote]],
         wanted=united.wanted,
     )
-
-
-def _with_both_histories(vi_map: VIMap, absorbed: I64, survivor: I64) -> VIMap:
-    """Return the map in which survivors (N,) have the evidence of absorbed landmarks (N,), too."""
-    if len(absorbed) == 0 or not has_evidence(vi_map):
-        return vi_map
-    return with_evidence(vi_map, inherit(read_evidence(vi_map), absorbed, survivor))
 
 
 def _triangulate(vi_map: VIMap, landmarks: I64) -> VIMap:

@@ -10,6 +10,7 @@ import dataclasses
 
 import numpy as np
 
+from maplab_py.algorithms.landmarks.evidence import with_inherited
 from maplab_py.algorithms.localization.database import database_of_map
 from maplab_py.algorithms.localization.localization import queries, query_vertices
 from maplab_py.algorithms.localization.localizer import Localizer, Outcome
@@ -19,7 +20,7 @@ from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, yaw
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap, observer_counts
-from maplab_py.vimap.edits import merge_landmarks
+from maplab_py.vimap.edits import merge_landmarks, survivors
 
 _AGREE_M, _AGREE_RAD = 1.0, np.deg2rad(10.0)
 """Differences of localised poses from the aligned trajectory: the odometry of the session drifts."""
@@ -110,9 +111,10 @@ def with_matches(vi_map: VIMap, keypoint: I64, landmark: I64) -> tuple[VIMap, in
     _, first = np.unique(pairs[0], return_index=True)
     enough = votes[first] >= np.minimum(observer_counts(vi_map)[pairs[0, first]], _MIN_VOTES)
     source, target = pairs[:, first[enough]]
-    before = len(vi_map.landmarks)
-    merged = merge_landmarks(vi_map, source, target)
-    return merged, before - len(merged.landmarks)
+    survivor = survivors(source, target, len(vi_map.landmarks))
+    absorbed = np.flatnonzero(survivor != np.arange(len(survivor)))
+    inherited = with_inherited(vi_map, absorbed, survivor[absorbed])
+    return merge_landmarks(inherited, source, target), len(absorbed)
 
 
 def _with_observations(vi_map: VIMap, keypoint: I64, landmark: I64) -> VIMap:

@@ -124,6 +124,69 @@ def test_a_session_counts_once() -> None:
     assert (united["recent"]["time_s"][0] > 0).sum() == 2
 
 
+def with_sessions(evidence: np.ndarray, days: list[int]) -> np.ndarray:
+    rows = np.arange(len(evidence))
+    for day in days:
+        session = Session(DAY_S * day, rows, np.full(len(rows), 3), np.full(len(rows), day % 2))
+        _, full = add_session(evidence, session)
+        evidence = summarise_oldest(evidence, full, OPTIONS, PRIOR)
+        evidence, _ = add_session(evidence, session)
+    return evidence
+
+
+def test_the_order_in_which_sessions_are_added_does_not_matter() -> None:
+    born = no_evidence(2)
+    born["born_s"] = DAY_S
+    in_order = with_sessions(born, [5, 10, 20, 40])
+    mixed = with_sessions(born, [40, 10, 5, 20])
+    assert mixed.tobytes() == in_order.tobytes()
+
+
+def test_summarised_sessions_are_not_counted_again() -> None:
+    born = no_evidence(2)
+    born["born_s"] = DAY_S
+    days = list(range(2, 2 + RECENT + 4))
+    full = with_sessions(born, days)
+    assert full["hits"][0] + full["misses"][0] == 4
+    assert with_sessions(full, days).tobytes() == full.tobytes()
+    missing = with_sessions(born, [d for d in days if d != 4])
+    assert with_sessions(missing, [4]).tobytes() == missing.tobytes()
+
+
+def test_summaries_of_merged_landmarks_are_not_added_up() -> None:
+    born = no_evidence(2)
+    born["born_s"] = DAY_S
+    evidence = with_sessions(born, list(range(2, 2 + RECENT + 4)))
+    assert inherit(evidence, np.array([1]), np.array([0]))[0] == evidence[0]
+    evidence[1] = with_sessions(born, [2, 3, 30])[1]
+    merged = inherit(evidence, np.array([1]), np.array([0]))[0]
+    assert merged["hits"] == evidence["hits"][0]
+    days = merged["recent"]["time_s"] // DAY_S
+    assert days.tolist() == [*range(7, 2 + RECENT + 4), 30]
+
+
+def test_the_filter_is_the_sum_over_uneven_times() -> None:
+    from scipy.special import beta
+
+    days, hits = [3, 10, 60, 61], [1, 1, 0, 0]
+    w, life, f = OPTIONS.lasting_share, OPTIONS.lifetime_days, OPTIONS.false_match
+    survival = [w + (1 - w) * np.exp(-day / life) for day in (0, *days)]
+    table = []  # joint probability of the outcomes and of vanishing after so many of them
+    for alive in range(len(days) + 1):
+        n = sum(hits[:alive])
+        seen = beta(PRIOR.hits + n, PRIOR.misses + alive - n) / beta(PRIOR.hits, PRIOR.misses)
+        after = np.prod([f if hit else 1 - f for hit in hits[alive:]])
+        until = survival[alive + 1] if alive < len(days) else 0.0
+        table.append(seen * after * (survival[alive] - until))
+    evidence = no_evidence(1)
+    evidence["born_s"] = DAY_S
+    for day, hit in zip(days, hits, strict=True):
+        session = Session(DAY_S * (1 + day), np.array([0]), np.array([1]), np.array([hit]))
+        evidence, _ = add_session(evidence, session)
+    expected = table[-1] / sum(table)
+    assert existence(evidence, OPTIONS, detection=PRIOR) == pytest.approx(expected, rel=1e-9)
+
+
 def test_a_merged_landmark_inherits_both_histories() -> None:
     evidence = histories(np.array([[1, 0, -1], [-1, 1, 0], [1, 1, 1]]))
     merged = inherit(evidence, np.array([1]), np.array([0]))
