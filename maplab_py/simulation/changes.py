@@ -4,8 +4,6 @@ A world that changes holds every point and box that ever exists, with masks of t
 do: a piece of furniture that moves leaves its points and gets new ones of the same appearance elsewhere.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -33,16 +31,17 @@ def with_changes(
     """Return the world with everything that exists in any of some sessions.
 
     Raises:
-        UserError: The world has no rooms with furniture.
+        UserError: The world has no rooms with furniture, or objects that move all the time.
     """
     if options.layout != "rooms" or options.corridor_rooms or options.furniture_per_room == 0:
         raise UserError("changes: only worlds of rooms with furniture change")
+    if options.moving_objects:
+        raise UserError("changes: give moving_objects: 0, objects that move cannot be replaced")
     builder = _Builder(world, options, changes, sessions, rng)
     for session in range(1, sessions):
-        is_refurbished = session == changes.refurbished_session
         builder.move_furniture(session, changes.moved_share)
         builder.replace_posters(session, changes.replaced_posters)
-        if is_refurbished:
+        if session == changes.refurbished_session:
             builder.replace_furniture(session, changes.refurbished_share)
             builder.replace_posters(session, changes.refurbished_posters)
     return builder.world()

@@ -6,6 +6,7 @@ from typing import Self
 import numpy as np
 
 from maplab_py.array_types import F32, F64
+from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.ply import PlyCloud, encode_ply
 from maplab_py.progress import SILENT, Progress
@@ -75,6 +76,8 @@ class SessionSimulator:
         self._scenario = scenario
         self.world = make_world(scenario.world, _generator(seeds.world, _WORLD))
         if scenario.changes.are_any:
+            if scenario.lidar.rate_hz > 0.0 or scenario.images.render:
+                raise UserError("changes: neither lidars nor rendered images show them")
             self.world = with_changes(
                 self.world,
                 scenario.world,
@@ -118,10 +121,8 @@ class SessionSimulator:
 
     def _session_appearance(self, number: int, rng: np.random.Generator) -> SessionAppearance:
         """Return what can be seen in a session, and what it looks like in its light."""
-        look, light = (
-            make_session_appearance(self._appearance, rng),
-            self._scenario.sessions[number].light,
-        )
+        look = make_session_appearance(self._appearance, rng)
+        light = self._scenario.sessions[number].light
         if self.world.exists is None:
             return look
         of_light = _generator(self._scenario.seeds.appearance, _LIGHT, light)

@@ -1,7 +1,5 @@
 """Commands that keep a map up to date with new sessions."""
 
-from __future__ import annotations
-
 from maplab_plugins.evaluation import map_of_key_or_folder
 from maplab_py.algorithms.keyframing.options import KeyframingOptions
 from maplab_py.algorithms.landmarks.persistence import PersistenceOptions

@@ -66,6 +66,17 @@ def test_only_furnished_rooms_change() -> None:
     world, changes = make_world(city, rng), ChangeOptions(moved_share=0.1)
     with pytest.raises(UserError, match="only worlds of rooms"):
         with_changes(world, city, changes, 2, rng)
+    with pytest.raises(UserError, match="moving_objects: 0"):
+        with_changes(world, dataclasses.replace(OPTIONS, moving_objects=1), changes, 2, rng)
+
+
+def test_lidars_and_images_do_not_show_changes() -> None:
+    scenario = load_scenario("office_year")
+    lidar = dataclasses.replace(scenario.lidar, rate_hz=2.0)
+    images = dataclasses.replace(scenario.images, render=True)
+    for shown in ({"lidar": lidar}, {"images": images}):
+        with pytest.raises(UserError, match="neither lidars nor rendered images"):
+            SessionSimulator(dataclasses.replace(scenario, **shown))
 
 
 def test_sessions_of_a_year_see_the_world_of_their_day() -> None:

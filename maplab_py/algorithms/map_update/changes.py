@@ -5,8 +5,6 @@ not detected; likewise one of the later sessions that the earlier ones did not s
 many more landmarks are missing than elsewhere.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -38,6 +36,8 @@ _MIN_EARLIER = 2
 """Earlier sessions that must have missed what counts as new: one misses much by chance."""
 _SAME_SHARE = 0.3
 """Share of a region's landmarks that look like those of another, if it has moved there."""
+_SAME_BITS = 0.2
+"""Share of different bits below which two descriptors look the same."""
 _MIN_MISS_RATE = 0.2
 """Rate of missed landmarks where nothing has changed, at least."""
 
@@ -67,11 +67,16 @@ def find_changes(vi_map: VIMap, later: Mask, progress: Progress = SILENT) -> Cha
     by_later, by_earlier = _seen_by(vi_map, later), _seen_by(vi_map, ~later)
     vanished, missed = _missing(vi_map, np.flatnonzero(later), by_earlier, by_later, progress)
     appeared, unseen = _missing(vi_map, np.flatnonzero(~later), by_later, by_earlier, progress)
-    note = ""
+    notes = []
     if np.count_nonzero(~later) < _MIN_EARLIER:
-        appeared, note = [], "one earlier session does not tell what appeared since"
+        appeared = []
+        notes.append("one earlier session does not tell what appeared since")
     times = session_times_s(vi_map)
     last, first = int(times[~later].max()), int(times[later].min())
+    if first < last:
+        notes.append(
+            "the later session begins before an earlier one: what vanished may have appeared"
+        )
     moved = _moves(vi_map, vanished, appeared)
     changes = []
     for number, region in enumerate(vanished):
@@ -91,7 +96,7 @@ def find_changes(vi_map: VIMap, later: Mask, progress: Progress = SILENT) -> Cha
         later=f"{np.datetime64(first, 's')}",
         landmarks_missed=int(missed.sum()),
         landmarks_new=int(unseen.sum()),
-        note=note,
+        note="; ".join(notes),
     )
 
 
@@ -179,10 +184,6 @@ def _moves(vi_map: VIMap, vanished: list[Region], appeared: list[Region]) -> dic
         if share >= _SAME_SHARE and a not in moves and b not in moves.values():
             moves[a] = b
     return moves
-
-
-_SAME_BITS = 0.2
-"""Share of different bits below which two descriptors look the same."""
 
 
 def _change(vi_map: VIMap, kind: str, region: Region, to: Region | None) -> Change:

@@ -1,7 +1,5 @@
 """Options and reports of map updates."""
 
-from __future__ import annotations
-
 import dataclasses
 
 from maplab_py.options import Options, option

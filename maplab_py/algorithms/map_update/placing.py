@@ -4,8 +4,6 @@ Localisation also works in thinned maps, where too few landmarks are left for th
 must agree on one alignment of the session's trajectory.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Budgets of a map: the landmarks and vertices that stay when new sessions have come."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 
@@ -20,11 +18,11 @@ from maplab_py.algorithms.sparsification.sparsify import sparsify
 from maplab_py.algorithms.statistics.statistics import bytes_by_kind
 from maplab_py.array_types import F64, I64, Mask, NDArray
 from maplab_py.distinct import distinct
+from maplab_py.errors import UserError
 from maplab_py.geometry import se3
 from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors import Extrinsics, OtherSensor, SensorSet
 from maplab_py.vimap import (
-    LandmarkQuality,
     MissionSensor,
     TransformationEdges,
     TransformationKind,
@@ -47,6 +45,8 @@ _MIN_MISSES = 2
 """Sessions that missed a landmark before it counts as vanished, however unlikely it is."""
 _ROUNDS, _MARGIN = 6, 0.97
 """Rounds in which both budgets shrink until the map is small enough, and the margin of each."""
+_LARGEST_STEP, _LEAST_SLOPE = 0.1, 0.1
+"""Bounds of a round: the smallest share of the last budgets, and of the size that falls with them."""
 _DRIFT, _SIGMA_M, _SIGMA_RAD = 0.01, 0.01, 0.005
 """Standard deviation of odometry edges between keyframes that stay: of their length, and at least."""
 
@@ -82,6 +82,9 @@ def thin(
         options: The budget.
         persistence: Priors of existence.
         progress: May cancel.
+
+    Raises:
+        UserError: The size cannot be met.
     """
     vanished = vanished_landmarks(vi_map, options, persistence)
     before = len(vi_map.landmarks)
@@ -89,14 +92,25 @@ def thin(
     start, ids = vi_map, vi_map.missions.id[new]
     landmarks = options.max_landmarks or len(vi_map.landmarks)
     vertices = options.max_vertices or len(vi_map.vertices)
+    share, last = 1.0, (0.0, 0.0)  # of both budgets; that of the last round with its size
     for _ in range(_ROUNDS):
-        vi_map, without_imu = _within(start, ids, landmarks, vertices, options, progress)
+        most = max(int(share * landmarks), 1), max(int(share * vertices), 1)
+        vi_map, without_imu = _within(start, ids, *most, options, persistence, progress)
         size = size_mb(vi_map)
         if options.max_map_mb == 0.0 or size <= options.max_map_mb:
             break
-        share = _MARGIN * options.max_map_mb / size
-        landmarks = max(int(share * len(vi_map.landmarks)), 1)
-        vertices = max(int(share * len(vi_map.vertices)), 1)
+        if share == 1.0:
+            landmarks, vertices = len(vi_map.landmarks), len(vi_map.vertices)
+        # sensors and new inertial measurements stay: the size is a line through the last two
+        slope = max((last[1] - size) / (last[0] - share), _LEAST_SLOPE * size / share)
+        last = share, size
+        excess = (size - _MARGIN * options.max_map_mb) / slope
+        share = float(np.clip(share - excess, _LARGEST_STEP * share, _MARGIN * share))
+    else:
+        raise UserError(
+            f"--max_map_mb={options.max_map_mb:g} cannot be met: the map has {size:.3g} MB with "
+            f"{len(vi_map.vertices)} vertices and {len(vi_map.landmarks)} landmarks"
+        )
     return vi_map, Thinned(
         landmarks_vanished=int(vanished.sum()),
         landmarks_thinned=before - int(vanished.sum()) - len(vi_map.landmarks),
@@ -124,12 +138,14 @@ def _within(
     landmarks: int,
     vertices: int,
     options: UpdateOptions,
+    persistence: PersistenceOptions,
     progress: Progress,
 ) -> tuple[VIMap, int]:
     """Return the map with at most so many landmarks and vertices, and the missions without IMU."""
-    good = int(np.count_nonzero(vi_map.landmarks.quality == LandmarkQuality.GOOD))
-    if len(vi_map.landmarks) > landmarks and good:
-        vi_map, _, _ = sparsify(vi_map, landmarks, SparsificationOptions(), progress=progress)
+    if len(vi_map.landmarks) > landmarks:
+        vi_map, _, _ = sparsify(
+            vi_map, landmarks, SparsificationOptions(), persistence, progress=progress
+        )
     if len(vi_map.vertices) <= vertices:
         return vi_map, 0
     kept = choose_vertices(vi_map, vertices, options.observers_kept)

@@ -1,7 +1,5 @@
 """Update a map with a session: anchor, merge, optimise, gather evidence, keep the budget."""
 
-from __future__ import annotations
-
 from datetime import UTC, datetime
 
 import numpy as np
@@ -46,6 +44,7 @@ from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.array_types import I64
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.progress import SILENT, Progress
+from maplab_py.report import counted
 from maplab_py.vimap import IdArray, VIMap, to_hex
 from maplab_py.vimap.edits import content_rng, with_new_ids
 from maplab_py.vimap.merge import check_disjoint, merge_maps
@@ -110,15 +109,11 @@ def update_map(
         progress: May cancel.
 
     Raises:
-        UserError: No mission of the map is anchored.
+        UserError: No mission of the map is anchored, or the budget cannot be met.
         MapError: The session does not fit the map, or is in it already.
         EstimationError: The session cannot be anchored in the map, or not be optimised.
     """
-    if not vi_map.baseframes.is_known[vi_map.missions.baseframe].any():
-        raise UserError(
-            "no mission of the map is anchored: run set_mission_baseframe_to_known first",
-            remedy="set_mission_baseframe_to_known",
-        )
+    _check_anchored(vi_map)
     if assign_new_ids:
         session = with_new_ids(session, content_rng(vi_map, "update", session))
     check_disjoint(vi_map, session)
@@ -148,6 +143,11 @@ def update_map(
         missions_without_imu=thinned.missions_without_imu,
         megabytes_before=size_mb(vi_map),
         megabytes_after=size_mb(result),
+        notes=tuple(
+            f"session {line.session} tells nothing: it should have seen no landmark of an earlier one"
+            for line in lines
+            if line.predicted == 0
+        ),
     )
 
 
@@ -185,27 +185,35 @@ def merge_session(
     return evaluate_quality(whole, quality, missions=rows, progress=progress)[0], merged
 
 
-def changes_since(
-    vi_map: VIMap,
-    session: VIMap,
-    *,
-    assign_new_ids: bool = False,
-    progress: Progress = SILENT,
-) -> ChangeReport:
+def changes_since(vi_map: VIMap, session: VIMap, *, progress: Progress = SILENT) -> ChangeReport:
     """Return the regions in which a session differs from a map; neither is changed.
 
     Raises:
-        MapError: The session does not fit the map, or is in it already.
+        UserError: No mission of the map is anchored, or the session is in the map.
+        MapError: The session does not fit the map.
         EstimationError: The session cannot be anchored in the map, or not be optimised.
     """
-    if assign_new_ids:
-        session = with_new_ids(session, content_rng(vi_map, "changes", session))
-    check_disjoint(vi_map, session)
+    _check_anchored(vi_map)
+    shared = np.count_nonzero(vi_map.vertex_index.rows(session.vertices.id) >= 0)
+    if shared > 2 * len(session.missions):  # parts of a recording share the vertices at their ends
+        raise UserError(
+            "the other map is in the selected one: --changes needs one of another session"
+        )
+    # the result is a report: ids do not matter, and parts of a recording have equal ones
+    session = with_new_ids(session, content_rng(vi_map, "changes", session))
     prepared = prepare_session(session, progress=progress)
     whole, _ = merge_session(vi_map, prepared, progress=progress)
     later = np.zeros(len(whole.missions), dtype=np.bool_)
     later[whole.mission_index.rows(prepared.missions.id)] = True
     return find_changes(whole, later, progress)
+
+
+def _check_anchored(vi_map: VIMap) -> None:
+    if not vi_map.baseframes.is_known[vi_map.missions.baseframe].any():
+        raise UserError(
+            "no mission of the map is anchored: run set_mission_baseframe_to_known first",
+            remedy="set_mission_baseframe_to_known",
+        )
 
 
 def _at_place(session: VIMap, placed: Placed) -> VIMap:
@@ -313,7 +321,7 @@ def gather_all(
     exists = existence(evidence[used], persistence, at_s=at_s, detection=detection)
     counts = np.histogram(exists, [0.0, 0.1, 0.5, 0.9, 1.0 + 1e-9])[0]
     unknown = int(np.count_nonzero(~known))
-    note = f"{unknown} missions are not anchored and tell nothing" if unknown else ""
+    note = f"without evidence, as not anchored: {counted(unknown, 'mission')}" if unknown else ""
     report = GatheringReport(
         sessions=tuple(lines),
         landmarks=len(evidence),

@@ -1,11 +1,9 @@
 """Prediction of which landmarks a session should see, and which it sees.
 
 A landmark is predicted in an image if it projects into it, from a direction and distance near those of its
-observers, and nothing nearer hides it: neither landmarks that the image observes around it, nor a map's
-surfaces. It is matched if the image observes it, or a similar descriptor is near its projection.
+observers, and the landmarks that the image observes around it are not much nearer. It is matched if the image
+observes it, or a similar descriptor is near its projection.
 """
-
-from __future__ import annotations
 
 import dataclasses
 

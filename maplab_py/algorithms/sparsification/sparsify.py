@@ -33,6 +33,7 @@ from maplab_py.memory import require_memory
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import LandmarkQuality, VIMap, edits, observer_counts, table, to_hex
 
+_PERSISTENCE = PersistenceOptions()
 _BYTES_PER_OBSERVATION = 400
 _WORST = 10
 """Keyframes that the report names."""
@@ -52,6 +53,7 @@ def sparsify(
     vi_map: VIMap,
     keep: int,
     options: SparsificationOptions,
+    persistence: PersistenceOptions = _PERSISTENCE,
     *,
     progress: Progress = SILENT,
 ) -> tuple[VIMap, SparsificationReport, Coverage]:
@@ -64,6 +66,7 @@ def sparsify(
         vi_map: The map.
         keep: Landmarks to keep.
         options: Method and parameters of the selection.
+        persistence: Priors of existence, where the map has evidence.
         progress: Progress.
 
     Raises:
@@ -82,7 +85,7 @@ def sparsify(
         )
     problem, vertex = coverage_problem(judged, good, min(keep, len(good)), options)
     if has_evidence(judged):
-        problem = with_weights_of_evidence(problem, judged, good)
+        problem = with_weights_of_evidence(problem, judged, good, persistence)
     if keep >= len(good):
         everything = np.ones(len(good), dtype=np.bool_)
         value = problem.objective(everything)
@@ -147,13 +150,13 @@ def coverage_problem(
 
 
 def with_weights_of_evidence(
-    problem: CoverageProblem, vi_map: VIMap, landmarks: I64
+    problem: CoverageProblem, vi_map: VIMap, landmarks: I64, options: PersistenceOptions
 ) -> CoverageProblem:
     """Return a problem that weights landmarks (L,) by the probability that a session matches them.
 
     It is the probability that the landmark exists, times that of a match if it does.
     """
-    evidence, options = read_evidence(vi_map)[landmarks], PersistenceOptions()
+    evidence = read_evidence(vi_map)[landmarks]
     detection = learn_detection(evidence, options)
     exists = existence(evidence, options, detection=detection)
     chance = np.clip(exists * match_rates(evidence, options, detection), 1e-3, 1.0)

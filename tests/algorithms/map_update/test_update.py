@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 
 from maplab_py.algorithms.landmarks.evidence import has_evidence, read_evidence
+from maplab_py.algorithms.landmarks.persistence import PersistenceOptions
 from maplab_py.algorithms.map_update.changes import find_changes
 from maplab_py.algorithms.map_update.options import UpdateOptions
+from maplab_py.algorithms.map_update.placing import with_matches
+from maplab_py.algorithms.map_update.thinning import thin
 from maplab_py.algorithms.map_update.update import changes_since, prepare_session, update_map
 from maplab_py.console.session.session import Session
 from maplab_py.errors import MapError, UserError
@@ -92,12 +95,38 @@ def test_a_size_is_kept() -> None:
     assert len(judged.sessions) == 2
 
 
+def test_a_size_that_cannot_be_met_is_refused() -> None:
+    vi_map, _ = updated()
+    is_new = np.array([False, True])
+    options = UpdateOptions(max_map_mb=1e-4)
+    with pytest.raises(UserError, match=r"--max_map_mb=0\.0001 cannot be met: the map has"):
+        thin(vi_map, is_new, options, PersistenceOptions())
+
+
+def test_a_landmark_that_a_session_merges_keeps_its_evidence() -> None:
+    vi_map, _ = updated()
+    evidence = read_evidence(vi_map)
+    observers = np.diff(vi_map.observation_start)
+    hits = (evidence["recent"]["matched"] > 0).any(axis=1)
+    source = int(np.flatnonzero(hits & (observers >= 2))[0])
+    target = int(np.flatnonzero(~hits)[0])
+    keypoints = np.flatnonzero(vi_map.keypoints.landmark == source)
+    merged, count = with_matches(vi_map, keypoints, np.full(len(keypoints), target))
+    assert count == 1
+    row = int(merged.landmark_index.rows(vi_map.landmarks.id[[target]])[0])
+    assert (read_evidence(merged)["recent"][row]["matched"] > 0).any()
+
+
 def test_mistakes_are_one_line() -> None:
     vi_map, _ = updated()
     with pytest.raises(MapError, match="is in both maps"):
         update_map(vi_map, sessions().maps[1])
     with pytest.raises(UserError, match="set_mission_baseframe_to_known"):
         update_map(sessions().maps[0], sessions().maps[1])
+    with pytest.raises(UserError, match="set_mission_baseframe_to_known"):
+        changes_since(sessions().maps[0], sessions().maps[1])
+    with pytest.raises(UserError, match="is in the selected one"):
+        changes_since(vi_map, sessions().maps[1])
     session = Session()
     session.maps.add("map", vi_map)
     with pytest.raises(UserError, match="--session=FOLDER"):
