@@ -188,6 +188,8 @@ def _is_borrowed(value: Any, names: set[str], lower: Any) -> bool:
     if not isinstance(value, ir.Expr):
         return isinstance(value, ir.Arg)
     match value.op:
+        case "getattr" if value.attr == "imag":  # of real numbers, it is made
+            return False
         case "getattr" | "static_getitem" | "exhaust_iter" | "cast":
             return value.value.name in names
         case "getitem":  # an index that is an array makes a copy
@@ -198,7 +200,11 @@ def _is_borrowed(value: Any, names: set[str], lower: Any) -> bool:
             function = lower.typeof(value.func.name)
             is_view = getattr(function, "typing_key", None) == "array.reshape"
             is_tuple = isinstance(function, types.NamedTupleClass)
-            return (is_view and borrows(value.func)) or (is_tuple and borrows(*value.args))
+            named = [variable for _, variable in value.kws]
+            rest = [value.vararg] if value.vararg else []
+            return (is_view and borrows(value.func)) or (
+                is_tuple and borrows(*value.args, *named, *rest)
+            )
     return False
 
 

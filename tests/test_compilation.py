@@ -149,6 +149,24 @@ def test_a_kernel_keeps_what_it_returns_and_nothing_else(is_new: bool) -> None:
     assert after.mi_alloc - before.mi_alloc == after.mi_free - before.mi_free
 
 
+@compiled()
+def made(first: F64) -> tuple[float, float, float]:
+    named, several = Pair(first=first, second=np.ones(40)), (first, np.ones(40))
+    spread, nothing = Pair(*several), first.imag
+    several = (np.zeros(40), np.zeros(40))  # takes the place of what is freed too early
+    return named.second.sum(), spread.second.sum(), nothing.sum() + several[0].sum()
+
+
+def test_a_kernel_holds_what_it_makes_as_long_as_it_is_used() -> None:
+    made(np.zeros(5))  # compiles
+    numba.core.runtime.nrt._nrt.memsys_enable_stats()
+    count = numba.core.runtime.rtsys.get_allocation_stats
+    before = count()
+    assert made(np.ones(5)) == (40.0, 40.0, 0.0)
+    after = count()
+    assert after.mi_alloc - before.mi_alloc == after.mi_free - before.mi_free
+
+
 def test_a_closure_is_never_kept(tmp_path: Path) -> None:
     (tmp_path / "outer.py").write_text(
         "from maplab_py.compilation import compiled\n"
