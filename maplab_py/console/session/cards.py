@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import html
 import json
+import shlex
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -15,6 +16,7 @@ from maplab_py.atomic import write_file
 from maplab_py.errors import UserError
 from maplab_py.input_files import read_text
 from maplab_py.report import to_html
+from maplab_py.storage import checksums
 from maplab_py.storage.map_saving import CARD_FILE
 
 if TYPE_CHECKING:
@@ -79,7 +81,7 @@ class Card:
         try:
             text = read_text(file, _MAX_BYTES, remedy="it is no card")
             return cls.from_dict(json.loads(text.partition(_BEGIN)[2].partition(_END)[0]))
-        except (ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError, RecursionError):
             raise UserError(f"{file}: is damaged, or no card: save the map again") from None
 
     def write(self, folder: Path, picture: str) -> None:
@@ -87,6 +89,7 @@ class Card:
 
         Raises:
             OSError: It cannot be written.
+            RecursionError: Too many cards are within each other.
         """
         facts: dict[str, Any] = {
             **self.contents,
@@ -97,17 +100,19 @@ class Card:
         content = json.dumps(dataclasses.asdict(self)).replace("</", "<\\/")
         title = html.escape(f"Map {self.map_key}")
         commands = html.escape("\n".join(self.commands))
+        line = html.escape(f"maplab reproduce {shlex.quote(str(folder))}")
         page = (
             f'<!doctype html><meta charset="utf-8"><title>{title}</title>\n'
             "<style>body{font:15px sans-serif;max-width:50em;margin:2em auto;padding:0 1em}"
             "th{text-align:left;vertical-align:top;padding-right:1em}pre{overflow-x:auto}</style>\n"
             f"<h1>{title}</h1>\n{picture}\n{to_html(facts)}\n"
             f"<h2>Commands</h2>\n<pre>{commands}</pre>\n"
-            f"<p><code>maplab reproduce {html.escape(str(folder))}</code> runs them again. A digest is of "
+            f"<p><code>{line}</code> runs them again. A digest is of "
             "the names, the sizes and both ends of the files.</p>\n"
             f"{_BEGIN}{content}{_END}\n"
         )
-        write_file(folder / CARD_FILE, [page.encode()])
+        # a name of a file may hold bytes that are no text
+        write_file(folder / CARD_FILE, [page.encode(errors="backslashreplace")])
 
 
 def digest_of(path: Path) -> str:
@@ -133,14 +138,21 @@ def digest_of(path: Path) -> str:
     return digest.hexdigest() if path.exists() else ""
 
 
-def input_of(path: Path) -> CardInput:
-    """Return an input as it is now, with the card of a map that has one."""
+def input_of(path: Path, fingerprint: str = "") -> CardInput:
+    """Return an input as it is now, with the card of a map that has one of its own.
+
+    Args:
+        path: File or folder.
+        fingerprint: Of the files of a map, if it is known.
+    """
     card = None
-    if (path / CARD_FILE).is_file():
-        try:
+    try:
+        if (path / CARD_FILE).is_file():
             card = Card.read(path)
-        except UserError:
-            card = None
+            if card.fingerprint != (fingerprint or checksums.fingerprint(path)):
+                card = None  # another program has replaced the map
+    except (UserError, OSError):
+        card = None
     return CardInput(str(path.absolute()), digest_of(path), card)
 
 

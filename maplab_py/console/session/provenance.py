@@ -61,11 +61,11 @@ class Provenance:
         before = base.selected if call.command.needs_map else ""
         from maplab_py.console.session.cards import input_of
 
-        paths = {name: path for name, path in call.values.items() if isinstance(path, Path)}
-        inputs = tuple(input_of(paths[name]) for name in call.command.reads if name in paths)
-        outputs = tuple(
-            str(path.absolute()) for name, path in paths.items() if name not in call.command.reads
-        )
+        copies = [entry.disk_copy for entry in result.entries.values() if entry.disk_copy]
+        known = {copy.folder: copy.fingerprint for copy in copies}
+        read_paths, written_paths = _paths_of(call)
+        inputs = tuple(input_of(path, known.get(path.resolve(), "")) for path in read_paths)
+        outputs = tuple(str(path.absolute()) for path in written_paths)
         text, number = _text(call), next(self._numbers)
         line = ScriptLine(number, text, before, result.selected, inputs, outputs)
         named = {value for value in call.values.values() if isinstance(value, str)}
@@ -90,22 +90,29 @@ class Provenance:
         return (*script, line)
 
     def write_cards(
-        self, base: MapsState, result: MapsState, accuracy_of: Callable[[MapEntry], str]
+        self,
+        call: Call,
+        base: MapsState,
+        result: MapsState,
+        accuracy_of: Callable[[MapEntry], str],
     ) -> None:
         """Write the cards of the maps that a command has saved.
 
         Raises:
             OSError: One cannot be written.
+            RecursionError: Too many cards are within each other.
         """
+        read, written = ({path.resolve() for path in paths} for paths in _paths_of(call))
         known = {id(entry.disk_copy) for entry in base.entries.values()}
         for entry in result.entries.values():
             copy, script = entry.disk_copy, self.script_of(entry)
             if copy is None or not entry.is_saved or id(copy) in known or not script:
                 continue
             inputs = tuple(dict.fromkeys(given for line in script for given in line.inputs))
-            read = {Path(given.path).resolve() for given in script[-1].inputs}
-            if not copy.fingerprint or not read.isdisjoint((copy.folder, *copy.folder.parents)):
-                continue  # it was loaded
+            folders = copy.folder, *copy.folder.parents
+            is_loaded = not read.isdisjoint(folders) and written.isdisjoint(folders)
+            if is_loaded or not copy.fingerprint:
+                continue
             from maplab_py.console.session.cards import write_card  # with the libraries of saving
 
             outputs = tuple(dict.fromkeys(path for line in script for path in line.outputs))
@@ -121,6 +128,14 @@ def script_text(script: Script) -> list[str]:
         lines.append(line.text)
         selected = line.selected_after
     return lines
+
+
+def _paths_of(call: Call) -> tuple[list[Path], list[Path]]:
+    """Return the paths that a call reads, and those that it writes."""
+    reads = call.command.reads
+    paths = {name: path for name, path in call.values.items() if isinstance(path, Path)}
+    written = [path for name, path in paths.items() if name not in reads]
+    return [paths[name] for name in reads if name in paths], written
 
 
 def _text(call: Call) -> str:

@@ -261,8 +261,8 @@ class Session:
             return report, base
         self.provenance.record(call, base, draft.maps.state)
         try:
-            self.provenance.write_cards(base, draft.maps.state, self._accuracy_of)
-        except OSError as error:
+            self.provenance.write_cards(call, base, draft.maps.state, self._accuracy_of)
+        except (OSError, ValueError, RecursionError) as error:
             terminal.note(f"the card of the saved map cannot be written: {error}")
         return report, draft.maps.state
 

@@ -69,7 +69,7 @@ def reproduce(
     ]
     with tempfile.TemporaryDirectory(prefix="maplab-reproduce-") as temporary:
         session, changed = _make(context, read, Path(temporary))
-        made = map_folder or Path(temporary) / "result" / read.map_key
+        made = map_folder or Path(temporary) / "result"
         session.run("save", map_folder=made)  # files round the last bit of rotations
         vi_map = load_map(made)[0]
     differing += changed
@@ -80,10 +80,10 @@ def reproduce(
     return Reproduction(len(read.commands), tuple(differing), _result(folder, read, vi_map))
 
 
-def _make(
-    context: CommandContext, card: Card, folder: Path, depth: int = 0
-) -> tuple[Session, list[CardFact]]:
+def _make(context: CommandContext, card: Card, folder: Path) -> tuple[Session, list[CardFact]]:
     """Run the commands of a card; return the session with its map selected, and the inputs that differ.
+
+    What they write goes into new folders in `folder`, also where a later one reads it.
 
     Raises:
         UserError: An input is missing.
@@ -95,15 +95,13 @@ def _make(
 
     paths: dict[str, str] = {}
     differing: list[CardFact] = []
-    for number, given in enumerate(card.inputs):
-        path, changed = _input(context, given, folder / f"input_{depth}_{number}", depth)
+    for given in card.inputs:
+        path, changed = _input(context, given, folder)
         paths[given.path] = str(path)
         differing += changed
-    for number, text in enumerate(card.outputs):
-        if text not in paths:
-            parent = folder / f"output_{depth}_{number}"
-            parent.mkdir()
-            paths[text] = str(parent / Path(text).name)
+    for text in card.outputs:
+        if paths.get(text, text) == text:
+            paths[text] = str(Path(tempfile.mkdtemp(dir=folder), Path(text).name))
     session = Session(context.session.registry, context.terminal)
     for line in card.commands:
         for words in split_commands(line):
@@ -116,9 +114,7 @@ def _make(
     return session, differing
 
 
-def _input(
-    context: CommandContext, given: CardInput, folder: Path, depth: int
-) -> tuple[Path, list[CardFact]]:
+def _input(context: CommandContext, given: CardInput, folder: Path) -> tuple[Path, list[CardFact]]:
     """Return the path of an input: as recorded, or made again where it was replaced."""
     from maplab_py.console.session.cards import digest_of
 
@@ -127,8 +123,8 @@ def _input(
     if now == given.digest:
         return path, []
     if given.card is not None:
-        session, differing = _make(context, given.card, folder.parent, depth + 1)
-        made = folder / path.name
+        session, differing = _make(context, given.card, folder)
+        made = Path(tempfile.mkdtemp(dir=folder), path.name)
         session.run("save", map_folder=made)
         return made, differing
     if not now:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from maplab_py.console.session.cards import CARD_FILE, Card, digest_of
+from maplab_py.console.session import cards
+from maplab_py.console.session.cards import CARD_FILE, Card, CardInput, digest_of, input_of
 from maplab_py.console.session.session import Session
-from maplab_py.errors import UserError
+from maplab_py.console.terminal.protocol import SilentTerminal
+from maplab_py.errors import EstimationError, UserError
 from maplab_py.storage.native import load_map, save_map
 from tests.vimap.builders import walk_map
 
@@ -102,3 +106,81 @@ def test_the_accuracy_is_that_of_the_saved_value(plain: Path, tmp_path: Path) ->
     session.run("keyframe_heuristic", kf_every_nth_vertex=2)
     session.run("save", map_folder=tmp_path / "changed")
     assert Card.read(tmp_path / "changed").accuracy == ""
+
+
+def test_two_replaced_inputs_are_both_made_again(plain: Path, tmp_path: Path) -> None:
+    sources = [edited(plain, tmp_path / name) for name in "ab"]
+    for source in sources:
+        card = dataclasses.replace(Card.read(source), outputs=(str(tmp_path / "written"),))
+        card.write(source, "")
+    result = edited(*sources[:1], tmp_path / "result", sources[1])
+    for source in sources:
+        save_map(walk_map(seed=2), source, overwrite=True)
+    report = Session().run("reproduce", card=result).as_dict()
+    assert report["differing"] == []
+    assert not (tmp_path / "written").exists()
+
+
+def test_a_path_that_is_read_and_written_stays_as_it_is(plain: Path, tmp_path: Path) -> None:
+    result = edited(plain, tmp_path / "result")
+    card = dataclasses.replace(Card.read(result), outputs=(str(plain),))
+    card.write(result, "")
+    digest = digest_of(plain)
+    with pytest.raises(EstimationError, match="load --map_folder"):
+        Session().run("reproduce", card=result)
+    assert digest_of(plain) == digest
+
+
+def test_a_map_saved_below_its_source_has_a_card(plain: Path) -> None:
+    session = Session()
+    session.run("load_merge_all_maps", maps_folder=plain.parent)
+    session.run("save", map_folder=plain.parent / "merged")
+    assert Card.read(plain.parent / "merged").commands[0].startswith("load_merge_all_maps")
+
+
+def test_a_map_that_is_saved_again_unchanged_keeps_a_card(plain: Path, tmp_path: Path) -> None:
+    result = edited(plain, tmp_path / "result")
+    session = Session()
+    session.run("load", map_folder=result)
+    session.run("save")
+    nested = Card.read(result).inputs[0].card
+    assert nested is not None
+    assert nested.inputs[0].path == str(plain)
+
+
+def test_the_card_of_a_map_that_was_replaced_is_not_taken_over(plain: Path, tmp_path: Path) -> None:
+    result = edited(plain, tmp_path / "result")
+    page = (result / CARD_FILE).read_text(encoding="utf-8")
+    assert input_of(result).card is not None
+    save_map(walk_map(seed=2), result, overwrite=True)
+    (result / CARD_FILE).write_text(
+        page, encoding="utf-8"
+    )  # as a program leaves it that knows no cards
+    assert input_of(result).card is None
+    assert Session().run("load", map_folder=result)
+
+
+def test_a_card_names_paths_that_are_no_text(tmp_path: Path) -> None:
+    folder = tmp_path / "it's \u00fc"
+    folder.mkdir()
+    given = CardInput("/caf\udce9/<b>", "00")
+    card = Card("m", "", {}, ("load",), (given,), (), {})
+    card.write(folder, "")
+    assert Card.read(folder) == card
+    page = (folder / CARD_FILE).read_text(encoding="utf-8")
+    assert "&lt;b&gt;</td>" in page
+    assert "maplab reproduce &#x27;" in page
+
+
+def test_a_card_that_cannot_be_written_leaves_the_map_saved(
+    plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any) -> str:
+        raise RecursionError("too deep")
+
+    monkeypatch.setattr(cards, "picture_of", fail)
+    notes: list[str] = []
+    monkeypatch.setattr(SilentTerminal, "note", lambda _, text: notes.append(text))
+    result = edited(plain, tmp_path / "result")
+    assert len(load_map(result)[0].vertices)
+    assert notes[-1] == "the card of the saved map cannot be written: too deep"
