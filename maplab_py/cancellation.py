@@ -96,6 +96,8 @@ class CancelToken:
     @contextmanager
     def ending_early(self) -> Iterator[None]:
         """Context of work that can end early; see `ending_early`."""
+        if not self._can_end_early:
+            self.is_ending = False  # an earlier block was asked to end, not this one
         self._can_end_early += 1
         try:
             yield

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from maplab_py.cancellation import ending_early
+from maplab_py.cancellation import CancelToken, ending_early
 from maplab_py.console.commands.command import describe
 from maplab_py.console.commands.registry import Plugin
 from maplab_py.console.scripts.runner import Runner
@@ -213,3 +213,16 @@ def test_a_session_knows_its_commands_as_functions(runner: Runner) -> None:
     assert "add_mission" in dir(session)
     with pytest.raises(AttributeError, match="no command 'nosuch'"):
         _ = session.nosuch
+
+
+def test_work_that_follows_is_asked_to_end_by_itself() -> None:
+    token = CancelToken()
+    with token.ending_early():
+        assert token.request_end()
+    with token.ending_early():  # as the viewer that is kept after a recording
+        assert not token.is_ending
+        assert token.request_end()
+        with token.ending_early():
+            assert token.is_ending
+            assert not token.request_end()
+    assert not token.request_end()
