@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import io
+from contextlib import nullcontext
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,14 +12,18 @@ from maplab_plugins.visualization.following import states_of
 from PIL import Image
 
 from maplab_py.console.session.maps import MapEntry
+from maplab_py.errors import UserError
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.viewer.building import Subject, build_scene
-from maplab_py.viewer.display.animation import evenly_spread, gif, with_caption
+from maplab_py.viewer.display import animation
+from maplab_py.viewer.display.animation import evenly_spread, gif, save_animation, with_caption
+from maplab_py.viewer.display.viewer import Viewer
 from maplab_py.viewer.drawing import make_drawing
 from maplab_py.viewer.history import MAX_STATES, State, error_curves, history_chart, state_layers
 from maplab_py.viewer.options import VisualizationOptions
 from maplab_py.viewer.scene import Segments
 from maplab_py.vimap import VIMap
+from tests.viewer.display.page_messages import page_state
 from tests.vimap.builders import walk_map
 
 MAP = walk_map(vertices=14, landmarks=300, seed=3)
@@ -87,6 +93,44 @@ def test_a_state_is_swiped_over_the_map() -> None:
     assert scene.notes[0] == "left of the line: before the first command"
     back = swiped.at_state(1, swipes=False)
     assert (back.place, back.other, back.arrangement) == (1, None, "over")
+
+
+def test_a_map_left_of_the_line_that_is_no_state_leaves_the_slider_at_the_map() -> None:
+    history = (State("", _bent(MAP, 5.0)), State("relax", MAP))
+    subject = Subject(MAP, history=history, other=_bent(MAP, 1.0), arrangement="swipe")
+    viewer = Viewer(0)
+    try:
+        viewer.show(subject)
+        assert page_state(viewer).control(label="state")["value"] == 1
+    finally:
+        viewer.stop()
+    back = subject.at_state(1, swipes=False)
+    assert (back.other, back.place) == (None, 1)
+
+
+def test_an_animation_has_each_state_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    history = (State("", _bent(MAP, 5.0)), State("relax", MAP))
+    subject = Subject(MAP, history=history).at_state(0, swipes=True)
+    viewer = Viewer(0)
+    shown: list[tuple[int, object]] = []
+
+    def render(*_: object, **__: object) -> np.ndarray:
+        assert viewer.subject is not None
+        shown.append((viewer.subject.place, viewer.subject.other))
+        return np.zeros((20, 30, 3), dtype=np.uint8)
+
+    monkeypatch.setattr(animation, "open_client", lambda *_: nullcontext())
+    monkeypatch.setattr(animation, "point_camera", lambda *_: {})
+    monkeypatch.setattr(animation, "render", render)
+    try:
+        viewer.show(subject)
+        with pytest.raises(UserError, match="is a folder"):
+            save_animation(viewer, tmp_path, (30, 20))
+        assert save_animation(viewer, tmp_path / "history.gif", (30, 20)) == (2, 2)
+        assert viewer.subject == subject
+    finally:
+        viewer.stop()
+    assert shown == [(0, None), (1, None)]
 
 
 def test_the_history_is_what_undo_and_redo_lead_to() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,12 +11,13 @@ import numpy as np
 from maplab_py.array_types import I64, U8
 from maplab_py.cancellation import check_cancelled
 from maplab_py.errors import UserError
-from maplab_py.output_files import write_bytes
+from maplab_py.output_files import check_writable, write_bytes
 from maplab_py.viewer.display.picture import open_client, point_camera, render
 from maplab_py.viewer.drawing import make_drawing
-from maplab_py.viewer.history import MAX_STATES, error_curves, state_facts
+from maplab_py.viewer.history import MAX_STATES, Curve, error_curves, state_facts
 
 if TYPE_CHECKING:
+    from maplab_py.viewer.building import Subject
     from maplab_py.viewer.display.viewer import Viewer
 
 _SHOWN_MS, _LAST_SHOWN_MS = 1200, 3000
@@ -42,6 +44,7 @@ def save_animation(
         UserError: The map has one state only, the file cannot be written, or there is no browser.
         EstimationError: The browser gave no picture.
     """
+    check_writable(path, overwrite=True)
     subject = viewer.wanted
     states = () if subject is None else subject.history
     if subject is None or len(states) < 2:
@@ -50,26 +53,38 @@ def save_animation(
     curves = error_curves([states[place] for place in chosen.tolist()], subject.truth)
     drawings = (make_drawing(states[place].vi_map, subject.options) for place in chosen.tolist())
     extent = max((drawing.extent for drawing in drawings), key=lambda each: each.radius_m)
-    frames: list[U8] = []
     pages = viewer.pages
     try:
         with open_client(viewer.server, viewer.url, size_px) as client:
             pose = point_camera(client, extent, view or ("" if pages else "overview"))
-            is_dark = viewer.is_dark
-            for number, place in enumerate(chosen.tolist()):
-                check_cancelled()
-                viewer.set_state(place)
-                viewer.wait()
-                picture = render(client, size_px, is_dark=is_dark, pose=pose)
-                title = f"{place + 1} of {len(states)}: {states[place].command or 'at first'}"
-                frames.append(
-                    with_caption(picture, (title, *state_facts(curves, number)), is_dark=is_dark)
-                )
+            picture = gif(_frames(viewer, subject, client, chosen, curves, size_px, pose))
     finally:
         viewer.follow(subject)
         viewer.wait()
-    write_bytes(path, [gif(frames)], overwrite=True)
-    return len(frames), len(states)
+    write_bytes(path, [picture], overwrite=True)
+    return len(chosen), len(states)
+
+
+def _frames(
+    viewer: Viewer,
+    subject: Subject,
+    client: Any,
+    chosen: I64,
+    curves: tuple[Curve, ...],
+    size_px: tuple[int, int],
+    pose: dict[str, Any],
+) -> Iterator[U8]:
+    """Give a picture (H, W, 3) RGB of each chosen state, without a state left of a swipe line."""
+    is_dark, states = viewer.is_dark, subject.history
+    if subject.arrangement == "swipe":
+        subject = subject.replace(other=None, arrangement="over")
+    for number, place in enumerate(chosen.tolist()):
+        check_cancelled()
+        viewer.follow(subject.replace(state=place))
+        viewer.wait()
+        picture = render(client, size_px, is_dark=is_dark, pose=pose)
+        title = f"{place + 1} of {len(states)}: {states[place].command or 'at first'}"
+        yield with_caption(picture, (title, *state_facts(curves, number)), is_dark=is_dark)
 
 
 def evenly_spread(count: int, limit: int = MAX_STATES) -> I64:
@@ -94,7 +109,7 @@ def with_caption(picture: U8, lines: tuple[str, ...], *, is_dark: bool) -> U8:
     return result
 
 
-def gif(frames: list[U8]) -> bytes:
+def gif(frames: Iterable[U8]) -> bytes:
     """Return a file of frames (H, W, 3) RGB that is played again and again."""
     import io
 
@@ -104,7 +119,7 @@ def gif(frames: list[U8]) -> bytes:
         Image.fromarray(frame).quantize(_COLOURS, dither=Image.Dither.NONE) for frame in frames
     ]
     file = io.BytesIO()
-    shown_ms = [_SHOWN_MS] * (len(frames) - 1) + [_LAST_SHOWN_MS]
+    shown_ms = [_SHOWN_MS] * (len(pictures) - 1) + [_LAST_SHOWN_MS]
     pictures[0].save(
         file, format="GIF", save_all=True, append_images=pictures[1:], duration=shown_ms, loop=0
     )

@@ -449,6 +449,18 @@ const drawBy = (make) => {
   }, 200);
 })();
 
+// A key that is held plays or pauses once.
+window.addEventListener(
+  "keydown",
+  (event) => {
+    if (event.code !== "Space" || !event.repeat) return;
+    if (/^(INPUT|TEXTAREA)$/.test(event.target.tagName)) return;
+    event.preventDefault(); // a button would be pressed
+    event.stopImmediatePropagation();
+  },
+  { capture: true },
+);
+
 // Lets the server read and write the page's address: of the messages of one page that viser has, those
 // of local storage do both. Behind the # is a view that was shared (links.py).
 (() => {

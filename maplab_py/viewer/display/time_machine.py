@@ -67,10 +67,13 @@ class TimeMachine:
             self.swipe.value = is_swiped
         if int(self.slider.max) != len(states) - 1:
             self.slider.max = len(states) - 1
-        if int(self.slider.value) != subject.place:
-            self.slider.value = subject.place
+        place = subject.place
+        if place < 0:  # another map is left of the swipe line
+            place = max(subject.replace(other=None).place, 0)
+        if int(self.slider.value) != place:
+            self.slider.value = place
         is_known = self._measured is not None and self._measured.history is states
-        self.chart.content = history_chart(states, self._curves if is_known else (), subject.place)
+        self.chart.content = history_chart(states, self._curves if is_known else (), place)
 
     def stop(self) -> None:
         """Change nothing any more: the server is about to stop."""

@@ -24,8 +24,8 @@ _MAX_RINGS = 3000
 _CORNERS = 10
 _TUBE_OPACITY = 0.45
 
-_CELLS = 64
-"""Voxels along the longer side of the map."""
+_CELLS, _LEAST_M = 64, 0.1
+"""Voxels along the longest side of the map or the path's height, and least length of that side."""
 _MAX_RAYS = 60_000
 _DIRECTIONS, _WELL_SEEN = 8, 3
 """Sectors of the compass, and from how many of them a voxel is to be seen through."""
@@ -167,10 +167,11 @@ def seen_volume(drawing: Drawing) -> SeenVolume | None:
     start, end = start[is_finite], end[is_finite]
     if not len(start):
         return None
-    outline, path = drawing.extent.outline, drawing.p_vertices
-    low, high = outline.min(axis=0), outline.max(axis=0)
-    cell = float((high - low)[:2].max()) / _CELLS
-    low[2], high[2] = path[:, 2].min() - 2.0 * cell, path[:, 2].max() + 2.0 * cell
+    low, high = drawing.extent.outline.min(axis=0), drawing.extent.outline.max(axis=0)
+    height = drawing.p_vertices[np.isfinite(drawing.p_vertices).all(axis=1), 2]
+    low[2], high[2] = height.min(), height.max()
+    cell = max(float((high - low).max()), _LEAST_M) / _CELLS
+    low[2], high[2] = low[2] - 2.0 * cell, high[2] + 2.0 * cell
     shape = np.maximum(np.ceil((high - low) / cell).astype(np.int64), 1)
     return SeenVolume(low, cell, _crossings(start, end, low, cell, shape))
 
@@ -220,13 +221,16 @@ def next_walks(drawing: Drawing, volume: SeenVolume) -> F64:
     from scipy.spatial import cKDTree
 
     fog = volume.is_foggy.sum(axis=2).astype(np.float64)
-    gain = uniform_filter(fog, 2 * _REACH + 1, mode="constant")
+    side = 2 * _REACH + 1
+    # whole numbers, so that equal places stay equal
+    gain = np.rint(side**2 * uniform_filter(fog, side, mode="constant"))
     cells = np.argwhere(volume.directions.max(axis=2) > 0)  # rays cross them: nothing is in the way
     p = volume.centres(np.column_stack([cells, np.zeros(len(cells), dtype=np.int64)]))
     path = drawing.p_vertices[np.isfinite(drawing.p_vertices).all(axis=1)]
     distance, nearest = cKDTree(path[:, :2]).query(p[:, :2])
     p[:, 2] = path[nearest, 2]
-    order = np.argsort(-np.where(distance > 2.0 * volume.cell_m, gain[tuple(cells.T)], 0.0))
+    off_path = np.where(distance > 2.0 * volume.cell_m, gain[tuple(cells.T)], 0.0)
+    order = np.argsort(-off_path, kind="stable")
     chosen: list[int] = []
     for place in order.tolist():
         if len(chosen) == _WALKS or gain[tuple(cells[place])] <= 0.0:

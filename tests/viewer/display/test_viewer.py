@@ -12,6 +12,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec.msgpack
 import numpy as np
 import pytest
 import viser
@@ -243,6 +244,27 @@ def test_colouring_changes_the_legend(viewer: Viewer) -> None:
     viewer.set_colouring("quality")
     assert viewer.wait(10.0)
     assert "not judged" in page_state(viewer).html
+
+
+def test_the_space_bar_plays_and_pauses(viewer: Viewer) -> None:
+    viewer.playback.configure(PlaybackOptions(steps=40, vertex_frequency=0.5))
+    time_line = viewer.playback.time_line
+    with open_page(viewer) as page:
+        sent = read_until(page, is_replayed)
+        commands = [m for m in sent if m["type"] == "RegisterCommandMessage"]
+        (space,) = (m["uuid"] for m in commands if m["props"]["hotkey"] == "space")
+        camera = {
+            "type": "ViewerCameraMessage", "wxyz": (1.0, 0.0, 0.0, 0.0), "position": (0.0, 0.0, 9.0),
+            "fov": 1.0, "near": 0.1, "far": 100.0, "image_height": 480, "image_width": 640,
+            "look_at": (0.0, 0.0, 0.0), "up_direction": (0.0, 0.0, 1.0),
+        }  # fmt: skip
+        page.send(msgspec.msgpack.encode(camera))  # without which a page does not count yet
+        assert wait_until(lambda: viewer.pages == 1)
+        for is_playing in (True, False):
+            press = {"type": "CommandTriggerMessage", "uuid": space}
+            page.send(msgspec.msgpack.encode(press))
+            assert wait_until(lambda wanted=is_playing: time_line.is_playing is wanted)
+    assert viewer.player is not None
 
 
 def test_playing_shows_the_map_grow(two_missions: VIMap) -> None:

@@ -19,12 +19,13 @@ from maplab_py.geometry import se3, so3
 from maplab_py.storage.extension_fields import with_extension
 from maplab_py.viewer import colours
 from maplab_py.viewer.building import Subject, build_scene
+from maplab_py.viewer.drawing import make_drawing
 from maplab_py.viewer.facts import facts
 from maplab_py.viewer.layers import covariances
 from maplab_py.viewer.layers.closures import ACCEPTED, REFUSED
 from maplab_py.viewer.layers.clouds import Cloud
 from maplab_py.viewer.layers.covariances import ABSOLUTE_POSES, LOOP_CLOSURES, ellipsoids
-from maplab_py.viewer.layers.coverage import SeenVolume, _crossings
+from maplab_py.viewer.layers.coverage import SeenVolume, _crossings, next_walks, seen_volume
 from maplab_py.viewer.options import VisualizationOptions
 from maplab_py.viewer.picking import pick
 from maplab_py.viewer.scene import (
@@ -427,3 +428,16 @@ def test_a_map_that_nothing_determines_has_no_tube_and_says_so() -> None:
     scene = build_scene(Subject(bare, options=options))
     assert "uncertainty" not in scene.names
     assert any(note.startswith("Uncertainty of the path: ") for note in scene.notes)
+
+
+def test_a_lost_vertex_and_a_steep_path_have_a_volume_of_bounded_size() -> None:
+    whole = walk_map(seed=1)
+    T_M_I = np.array(whole.vertices.T_M_I)
+    T_M_I[:, 4:] *= [0.01, 0.01, 50.0]
+    T_M_I[0, 4:] = np.nan
+    steep = whole.replace(vertices=whole.vertices.replace(T_M_I=T_M_I))
+    drawing = make_drawing(steep, VisualizationOptions())
+    volume = seen_volume(drawing)
+    assert volume is not None
+    assert max(volume.directions.shape) <= 69
+    assert np.isfinite(next_walks(drawing, volume)).all()
