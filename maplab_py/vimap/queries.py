@@ -211,11 +211,12 @@ _MARGIN = 0.03
 def limits_from_above(vi_map: VIMap, missions: NDArray[Any] | None = None) -> tuple[F64, F64]:
     """Return the corners (2,) and (2,) in G of a picture from above: all vertices and 95 % of the landmarks.
 
-    Landmarks that are judged bad do not count.
+    Landmarks that are judged bad do not count, nor do positions that are no numbers.
     """
     p_G = vi_map.T_G_I[mission_mask(vi_map, missions)[vi_map.vertices.mission], 4:6]
     good = vi_map.landmarks.quality != LandmarkQuality.BAD
     landmarks = vi_map.p_G[landmark_mask(vi_map, missions) & good, :2]
+    p_G, landmarks = (p[np.isfinite(p).all(axis=1)] for p in (p_G, landmarks))
     if len(landmarks):
         p_G = np.concatenate([p_G, np.percentile(landmarks, _SHARE_SHOWN, axis=0)])
     low, high = p_G.min(axis=0), p_G.max(axis=0)

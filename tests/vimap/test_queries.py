@@ -7,7 +7,12 @@ from maplab_py.errors import UserError
 from maplab_py.vimap import IdIndex, VIMap, comparison, merge, random_ids, statistics, to_hex
 from maplab_py.vimap import ids as ids_module
 from maplab_py.vimap.consistency import check_consistency
-from maplab_py.vimap.queries import coobservation_counts, find_mission, observer_counts
+from maplab_py.vimap.queries import (
+    coobservation_counts,
+    find_mission,
+    limits_from_above,
+    observer_counts,
+)
 from tests.vimap.builders import walk_map
 
 
@@ -133,3 +138,17 @@ def test_any_change_makes_another_map() -> None:
         a.replace(sensors=type(a.sensors)()),
     ):
         assert not comparison.is_same(a, changed)
+
+
+def test_a_picture_from_above_leaves_out_what_has_no_place() -> None:
+    whole = walk_map(seed=1)
+    T_M_I, p_I = np.array(whole.vertices.T_M_I), np.array(whole.landmarks.p_I)
+    T_M_I[-1, 4:] = np.nan
+    p_I[3] = np.nan
+    vi_map = whole.replace(
+        vertices=whole.vertices.replace(T_M_I=T_M_I), landmarks=whole.landmarks.replace(p_I=p_I)
+    )
+    low, high = limits_from_above(vi_map)
+    path = vi_map.T_G_I[:-1, 4:6]
+    assert (low < path.min(axis=0)).all()
+    assert (high > path.max(axis=0)).all()
