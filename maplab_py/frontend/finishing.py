@@ -252,7 +252,7 @@ def _calibration_notes(mapping: Mapping) -> list[str]:
     """Return what of the calibration was doubted, and what was found in its place."""
     odometry, zero_ns = mapping.odometry, mapping.statistics.zero_ns
     notes, delays = list(odometry.notes), odometry.delays
-    notes += [failure.words(zero_ns) for failure in odometry.watch.failures]
+    notes += odometry.watch.notes(zero_ns)
     if any(not each.sensor.startswith("camera") for each in odometry.watch.failures):
         notes.append(
             "where a part of the IMU was left out, the map has samples that follow from the images; after "

@@ -12,7 +12,7 @@ from maplab_py.array_types import F64, I64, U8
 from maplab_py.errors import EstimationError
 from maplab_py.frontend.backfill import Backfill
 from maplab_py.frontend.dead_reckoning import Tie, tied
-from maplab_py.frontend.failures.watch import SensorWatch, replaced, with_biases_of
+from maplab_py.frontend.failures.watch import SensorWatch, replace_failed
 from maplab_py.frontend.recorded_mission import RecordedMission, mission_map
 from maplab_py.frontend.run_options import MapBuilderOptions
 from maplab_py.interop.recordings.protocol import RecordedSensors, TrackedFrame
@@ -175,23 +175,10 @@ class MapBuilder:
         self._missions[-1].refine(states)
 
     def replace_samples(self, watch: SensorWatch) -> None:
-        """Put the motion of the states in place of the samples of parts of the IMU that had failed.
-
-        Biases stay as they were before: nothing was known of them meanwhile.
-        """
-        imu = self._device.imu
-        assert imu is not None
+        """Replace the samples of parts of the IMU that had failed; see `replace_failed`."""
+        assert self._device.imu is not None
         for mission in self._missions:
-            whole = mission.states[0] if mission.states else None
-            for row, (times_ns, samples) in enumerate(mission.edges):
-                parts = watch.failed_between(int(times_ns[0]), int(times_ns[-1]))
-                if not parts or whole is None:
-                    whole = mission.states[row + 1]
-                    continue
-                mission.states[row + 1] = with_biases_of(whole, mission.states[row + 1], parts)
-                ends = NavState.stack(mission.states[row : row + 2])
-                g = imu.gravity_magnitude_mps2
-                mission.edges[row] = times_ns, replaced(times_ns, samples, parts, ends, g)
+            replace_failed(mission, watch, self._device.imu.gravity_magnitude_mps2)
 
     def drop_after(self, time_ns: int) -> None:
         """Remove the vertices of the present mission after a time: their states are doubtful."""

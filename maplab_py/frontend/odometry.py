@@ -327,6 +327,9 @@ class Odometry:
         if self._delays is None or update.tracks is not None:
             return False
         begin = time.perf_counter()
+        if ImuPart.GYROSCOPE in frame.failed:  # its turns follow from the frame before
+            self._delays.reset()
+            return False
         has_new_delay = self._delays.push(frame)
         update.stage_ms["delay"] = 1e3 * (time.perf_counter() - begin)
         return has_new_delay
@@ -493,7 +496,7 @@ class Odometry:
         self._replayed = None
         self._detector.reset()
         self._backfiller.reset()
-        self.watch.restart()
+        self.watch.restart(self._last_ns or 0)
         if self._delays is not None:
             self._delays.reset()
         return f"started again: {reason}" if reason else ""

@@ -15,6 +15,7 @@ import numpy as np
 from maplab_py.array_types import F64, I32, I64, Mask
 from maplab_py.estimation.imu.inertial_data import InertialData
 from maplab_py.estimation.imu.preintegration import Preintegrated, integrate
+from maplab_py.estimation.window.frame import ImuPart
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.device import RecordedSensors
 from maplab_py.sensors import Imu
@@ -59,6 +60,7 @@ class Disagreement:
     rate: F64  # (3,) [rad/s] in I
     acceleration: F64  # (3,) [m/s^2] in I
     since_ns: int
+    biases: dict[ImuPart, F64]  # that were taken from the samples
     fit_rad: F64  # (C,) median angle between rays and landmarks in the newest frame; nan = too few
 
 
@@ -116,7 +118,10 @@ class MotionComparison:
             T_M_I, fit = pose
             poses.append(T_M_I)
         legs = self._integrated([span[1 : middle + 1], span[middle + 1 :]], snapshot.biases)
-        return _compare(np.array(poses), legs, self._imu, snapshot.time_ns, fit)
+        rate, acceleration = _compare(np.array(poses), legs, self._imu)
+        parts = ImuPart.GYROSCOPE, ImuPart.ACCELEROMETER
+        biases = dict(zip(parts, snapshot.biases, strict=True))
+        return Disagreement(rate, acceleration, snapshot.time_ns, biases, fit)
 
     def _pose(
         self, frame: Sighting, snapshot: _Snapshot, T_M_I: F64, cameras: frozenset[int]
@@ -163,8 +168,8 @@ class MotionComparison:
         return integrate(data, *biases)
 
 
-def _compare(T_M_I: F64, legs: Preintegrated, imu: Imu, since_ns: int, fit: F64) -> Disagreement:
-    """Compare poses (3, 7) with the two legs between them."""
+def _compare(T_M_I: F64, legs: Preintegrated, imu: Imu) -> tuple[F64, F64]:
+    """Return rate and acceleration of two legs minus those of the poses (3, 7) at their ends."""
     dt, g_M = legs.duration_s, np.array([0.0, 0.0, -imu.gravity_magnitude_mps2])
     seen = so3.multiply(so3.inverse(T_M_I[0, :4]), T_M_I[2, :4])
     measured = so3.multiply(legs.q_A_B[0], legs.q_A_B[1])
@@ -177,8 +182,7 @@ def _compare(T_M_I: F64, legs: Preintegrated, imu: Imu, since_ns: int, fit: F64)
         + so3.rotate(T_M_I[1, :4], legs.dp[1] / dt[1])
     )
     acceleration_M = (by_samples - (steps[1] - steps[0])) / (0.5 * dt.sum())
-    acceleration = so3.rotate(so3.inverse(T_M_I[1, :4]), acceleration_M)
-    return Disagreement(rate, acceleration, since_ns, fit)
+    return rate, so3.rotate(so3.inverse(T_M_I[1, :4]), acceleration_M)
 
 
 def pose_by_rays(p_M: F64, ray_I: F64, p_I_C: F64, T_M_I: F64) -> F64:

@@ -14,6 +14,7 @@ from maplab_py.frontend.failures.images import ImageWatch
 from maplab_py.frontend.failures.motion import Disagreement, MotionComparison, Sighting
 from maplab_py.frontend.failures.samples import PARTS, SampleWatch
 from maplab_py.frontend.imu_buffer import ImuInterval
+from maplab_py.frontend.recorded_mission import RecordedMission
 from maplab_py.geometry import so3
 from maplab_py.interop.device import RecordedSensors
 from maplab_py.sensors import Imu
@@ -30,6 +31,9 @@ _IN_ROW = 2
 _WHOLE_IN_ROW = 5
 """Comparisons that must agree with a constant bias until a part of the IMU is used again."""
 _MOST_RETURNS = 3
+_SETTLED_NS = 250_000_000
+"""Time in which the window finds the bias of a part that is used again."""
+_MOST_NOTES = 8
 _LOST_SHARE, _LOST_NS = 0.2, 600_000_000
 """A camera that sees so small a share of the points of its leader, for so long, compared with before."""
 _MISFIT_RAD = 0.01
@@ -47,13 +51,20 @@ class SensorFailure:
     detected_ns: int
     until_ns: int = 0  # 0 = to the end
     is_used: bool = False  # for want of another
+    is_by_motion: bool = False  # found by the motion of the images
+    has_new_bias: bool = False  # when it is used again
+
+    @property
+    def fate(self) -> str:
+        """What becomes of the sensor."""
+        return "used for want of another" if self.is_used else "left out"
 
     def words(self, zero_ns: int) -> str:
         """Return what has happened, in seconds after a time."""
         since_s, until_s = (1e-9 * (t - zero_ns) for t in (self.since_ns, self.until_ns))
         end = f"to {until_s:.1f} s" if self.until_ns else "on"
-        fate = "used for want of another" if self.is_used else "left out"
-        return f"{self.sensor} {fate} from {since_s:.1f} s {end}: {self.reason}"
+        later = "; used with another bias since" if self.has_new_bias else ""
+        return f"{self.sensor} {self.fate} from {since_s:.1f} s {end}: {self.reason}{later}"
 
 
 class SensorWatch:
@@ -71,18 +82,17 @@ class SensorWatch:
         self._samples = SampleWatch()
         self.failures: list[SensorFailure] = []
         self._open: dict[str, SensorFailure] = {}
-        self._last_motion = _StateMotion(np.zeros(3), np.zeros(3))
         self._returns = 0
-        self.restart()
+        self.restart(0)
 
-    def restart(self) -> None:
-        """Forget the motion; the estimator starts again."""
+    def restart(self, now_ns: int) -> None:
+        """Forget the motion, and use the whole IMU; the estimator starts again."""
         self._comparison = MotionComparison(self._device, self._imu)
         self._usual = {part: _Usual() for part in PARTS}
         self._shares: collections.deque[float] = collections.deque(maxlen=_REMEMBERED)
         self._lost_since_ns = 0
         for name in [name for name in self._open if not name.startswith("camera")]:
-            self._open.pop(name)
+            self._return(name, now_ns)
 
     @property
     def left_out(self) -> frozenset[int]:
@@ -102,7 +112,13 @@ class SensorWatch:
 
     def status(self) -> str:
         """Return what is left out now."""
-        return "; ".join(f"{f.sensor} left out: {f.reason}" for f in self._open.values())
+        return "; ".join(f"{f.sensor} {f.fate}: {f.reason}" for f in self._open.values())
+
+    def notes(self, zero_ns: int) -> list[str]:
+        """Return what has happened, in seconds after a time, a line a failure; the first ones of many."""
+        lines = [failure.words(zero_ns) for failure in self.failures[:_MOST_NOTES]]
+        more = len(self.failures) - len(lines)
+        return lines + ([f"sensors were left out {more} more times"] if more else [])
 
     def has_failed_between(self, from_ns: int, to_ns: int) -> bool:
         """Tell whether any sensor was left out at some time of an interval."""
@@ -116,6 +132,12 @@ class SensorWatch:
             if any(_was_out(each, from_ns, to_ns) for each in of_part):
                 result |= part
         return result
+
+    def has_new_bias(self, part: ImuPart, now_ns: int) -> bool:
+        """Tell whether a part of the IMU has come back with another bias from its latest failure."""
+        failures = (f for f in self.failures if f.sensor == _NAMES[part] and f.since_ns < now_ns)
+        latest = max(failures, key=lambda failure: failure.detected_ns, default=None)
+        return latest is not None and latest.has_new_bias
 
     # -- samples ----------------------------------------------------------------------------------
 
@@ -134,15 +156,16 @@ class SensorWatch:
                 smoother.doubt_imu(since_ns, part)
             elif name in self._open and part not in self._samples.signs:
                 failure = self._open[name]
-                if not failure.reason.startswith("it "):  # the samples themselves said so
+                if not failure.is_by_motion:
                     self._return(name, now_ns)
         if not self.failed:
             return interval, ImuPart(0)
         samples = interval.accel_gyro.copy()
+        rate_I, force_I = _constant_velocity(smoother, self._imu)
         if ImuPart.GYROSCOPE in self.failed:
-            samples[:, 3:] = self._last_motion.rate_I + smoother.states.motion[-1, 3:6]
+            samples[:, 3:] = rate_I + smoother.states.motion[-1, 3:6]
         if ImuPart.ACCELEROMETER in self.failed:
-            samples[:, :3] = self._last_motion.force_I + smoother.states.motion[-1, 6:]
+            samples[:, :3] = force_I + smoother.states.motion[-1, 6:]
         return dataclasses.replace(interval, accel_gyro=samples), self.failed
 
     # -- images -----------------------------------------------------------------------------------
@@ -200,7 +223,6 @@ class SensorWatch:
             interval: Its samples as measured.
             smoother: The window after it.
         """
-        self._last_motion = _motion_of(smoother, self._imu)
         self._comparison.push(
             Sighting(
                 frame.time_ns, frame.camera, frame.track_id, frame.uv_px,
@@ -242,31 +264,49 @@ class SensorWatch:
     def _judge(self, new: Disagreement, now_ns: int, smoother: FixedLagSmoother) -> None:
         """Leave parts of the IMU out, or take them back."""
         for part in (ImuPart.GYROSCOPE, ImuPart.ACCELEROMETER):
-            name, usual, error = _NAMES[part], self._usual[part], _of(new, part)
-            failure = self._open.get(name)
-            if failure is None:
-                excess = usual.add(part, error)
-                if part is ImuPart.GYROSCOPE and excess > 1.0:
-                    usual_of_other = self._usual[ImuPart.ACCELEROMETER]
-                    usual_of_other.in_row = 0  # gravity would be turned by the wrong rates
-                if usual.in_row >= _IN_ROW:
-                    unit = "rad/s" if part is ImuPart.GYROSCOPE else "m/s^2"
-                    size = float(np.linalg.norm(error - usual.bias))
-                    reason = f"it differs by {size:.2g} {unit} from the motion of the images"
-                    self._fail(name, reason, usual.since_ns, now_ns)
-                    smoother.doubt_imu(usual.since_ns, part)
-                    usual.recent.clear()
-                if excess > 1.0:
-                    return
-                usual.since_ns = new.since_ns
-            elif failure.reason.startswith("it "):
-                usual.recent.append(error)
-                if usual.agrees_with_a_bias(part) and self._returns < _MOST_RETURNS:
-                    usual.bias = np.mean(usual.recent, axis=0)
-                    self._returns += 1
-                    self._return(name, now_ns)
-                elif part is ImuPart.GYROSCOPE:
-                    return
+            failure, agrees = self._open.get(_NAMES[part]), False
+            if failure is None and new.since_ns >= self._usual[part].from_ns:
+                agrees = self._agrees(part, new, now_ns, smoother)
+            elif failure is not None and failure.is_by_motion:
+                self._reconsider(failure, part, new, now_ns)
+            if part is ImuPart.GYROSCOPE and not agrees:
+                # gravity would be turned by the wrong rates
+                self._usual[ImuPart.ACCELEROMETER].in_row = 0
+                return
+
+    def _agrees(
+        self, part: ImuPart, new: Disagreement, now_ns: int, smoother: FixedLagSmoother
+    ) -> bool:
+        """Return whether a part of the IMU agrees with the images; leave it out if not for long."""
+        usual, error = self._usual[part], _of(new, part)
+        if usual.add(part, error) <= 1.0:
+            usual.since_ns, usual.bias = new.since_ns, new.biases[part]
+            return True
+        if usual.in_row >= _IN_ROW:
+            unit = "rad/s" if part is ImuPart.GYROSCOPE else "m/s^2"
+            size = float(np.linalg.norm(error))
+            reason = f"it differs by {size:.2g} {unit} from the motion of the images"
+            self._fail(_NAMES[part], reason, usual.since_ns, now_ns)
+            self._open[_NAMES[part]].is_by_motion = True
+            smoother.doubt_imu(usual.since_ns, part)
+            usual.in_row = 0
+            usual.recent.clear()
+        return False
+
+    def _reconsider(
+        self, failure: SensorFailure, part: ImuPart, new: Disagreement, now_ns: int
+    ) -> None:
+        """Use a part of the IMU again that has agreed with a constant bias for a while.
+
+        The window finds this bias by itself: the bias is free while the part is left out.
+        """
+        usual = self._usual[part]
+        usual.recent.append(_of(new, part) + new.biases[part])
+        if self._returns < _MOST_RETURNS and usual.agrees_with_a_bias(part):
+            failure.has_new_bias = usual.has_new_bias(part)
+            usual.from_ns = now_ns + _SETTLED_NS
+            self._returns += 1
+            self._return(failure.sensor, now_ns)
 
     def _fail(self, name: str, reason: str, since_ns: int, detected_ns: int) -> None:
         failure = SensorFailure(name, reason, since_ns, detected_ns)
@@ -286,30 +326,36 @@ class _Usual:
 
     def __init__(self) -> None:
         self._sizes: collections.deque[float] = collections.deque(maxlen=_REMEMBERED)
-        self.recent: collections.deque[F64] = collections.deque(maxlen=_WHOLE_IN_ROW)
-        self.bias: F64 = np.zeros(3)  # with which it has come back
+        self.recent: collections.deque[F64] = collections.deque(maxlen=_WHOLE_IN_ROW)  # biases
+        self.bias: F64 = np.zeros(3)  # when it was whole
         self.in_row, self.since_ns = 0, 0
+        self.from_ns = 0  # from which on errors count
 
     def excess(self, part: ImuPart, error: F64) -> float:
         """Return the size of an error as a multiple of what is possible; 0 while nothing is known."""
         if len(self._sizes) < _FEWEST:
             return 0.0
-        return float(np.linalg.norm(error - self.bias)) / self._limit(part)
+        return float(np.linalg.norm(error)) / self._limit(part)
 
     def add(self, part: ImuPart, error: F64) -> float:
         """Take an error; return it as a multiple of what is possible."""
         excess = self.excess(part, error)
         self.in_row = self.in_row + 1 if excess > 1.0 else 0
         if not self.in_row:
-            self._sizes.append(float(np.linalg.norm(error - self.bias)))
+            self._sizes.append(float(np.linalg.norm(error)))
         return excess
 
     def agrees_with_a_bias(self, part: ImuPart) -> bool:
-        """Tell whether the newest errors are the same."""
+        """Tell whether the newest errors are those of the same bias."""
         if len(self.recent) < _WHOLE_IN_ROW:
             return False
         spread = np.linalg.norm(self.recent - np.mean(self.recent, axis=0), axis=1)
         return bool(spread.max() < 0.5 * self._limit(part))
+
+    def has_new_bias(self, part: ImuPart) -> bool:
+        """Tell whether this bias is another one than before the failure."""
+        change = np.mean(self.recent, axis=0) - self.bias
+        return float(np.linalg.norm(change)) > self._limit(part)
 
     def _limit(self, part: ImuPart) -> float:
         return max(_FLOOR[part], _FACTOR * float(np.median(self._sizes)))
@@ -319,33 +365,48 @@ def _of(disagreement: Disagreement, part: ImuPart) -> F64:
     return disagreement.rate if part is ImuPart.GYROSCOPE else disagreement.acceleration
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _StateMotion:
-    """Constant velocity, as an IMU without biases would measure it."""
-
-    rate_I: F64  # (3,)
-    force_I: F64  # (3,)
-
-
-def _motion_of(smoother: FixedLagSmoother, imu: Imu) -> _StateMotion:
-    """Return the motion between the two newest frames of a window."""
+def _constant_velocity(smoother: FixedLagSmoother, imu: Imu) -> tuple[F64, F64]:
+    """Return rate and specific force (3,), (3,) in I that go on as between the two newest frames."""
     T_M_I, times_ns = smoother.states.T_M_I[-2:], smoother.times_ns[-2:]
     force_I = so3.rotate(
         so3.inverse(T_M_I[-1, :4]), np.array([0.0, 0.0, imu.gravity_magnitude_mps2])
     )
     if len(times_ns) < 2:
-        return _StateMotion(np.zeros(3), force_I)
+        return np.zeros(3), force_I
     turned = so3.log(so3.multiply(so3.inverse(T_M_I[0, :4]), T_M_I[1, :4]))
-    return _StateMotion(turned / (1e-9 * float(times_ns[1] - times_ns[0])), force_I)
+    return turned / (1e-9 * float(times_ns[1] - times_ns[0])), force_I
 
 
-def with_biases_of(whole: NavState, state: NavState, parts: ImuPart) -> NavState:
-    """Return a state with the biases of another one for parts of the IMU that have failed."""
-    return dataclasses.replace(
-        state,
-        gyro_bias=whole.gyro_bias if ImuPart.GYROSCOPE in parts else state.gyro_bias,
-        accel_bias=whole.accel_bias if ImuPart.ACCELEROMETER in parts else state.accel_bias,
-    )
+def replace_failed(mission: RecordedMission, watch: SensorWatch, gravity_mps2: float) -> None:
+    """Put the motion of the states in place of the samples of parts of the IMU that had failed.
+
+    Biases stay as they were before: nothing was known of them meanwhile. When a part has come back with
+    another bias, the difference is taken from its samples, for biases of a map change slowly.
+    """
+    # in the order of samples, of the accelerometer first
+    found = np.array([np.hstack([s.accel_bias[0], s.gyro_bias[0]]) for s in mission.states])
+    biases, change, before = found.copy(), np.zeros(6), ImuPart(0)
+    for row, (times_ns, samples) in enumerate(mission.edges):
+        from_ns = int(times_ns[0])
+        failed = watch.failed_between(from_ns, int(times_ns[-1]))
+        for part, columns in PARTS.items():
+            if part in failed:
+                biases[row + 1, columns] = biases[row, columns]
+                continue
+            if part in before and watch.has_new_bias(part, from_ns):
+                change[columns] = found[row, columns] - biases[row, columns]
+            biases[row + 1, columns] = found[row + 1, columns] - change[columns]
+        before = failed
+        if not failed and not change.any():
+            continue
+        mission.states[row + 1] = dataclasses.replace(
+            mission.states[row + 1],
+            accel_bias=biases[row + 1 : row + 2, :3], gyro_bias=biases[row + 1 : row + 2, 3:],
+        )  # fmt: skip
+        ends = NavState.stack(mission.states[row : row + 2])
+        mission.edges[row] = (
+            times_ns, replaced(times_ns, samples - change, failed, ends, gravity_mps2)
+        )  # fmt: skip
 
 
 def replaced(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,12 +13,20 @@ from maplab_py.estimation.window.frame import ImuPart
 from maplab_py.frontend.failures.images import ImageWatch
 from maplab_py.frontend.failures.motion import pose_by_rays
 from maplab_py.frontend.failures.samples import SampleWatch
-from maplab_py.frontend.failures.watch import replaced
+from maplab_py.frontend.failures.watch import (
+    SensorFailure,
+    SensorWatch,
+    replace_failed,
+    replaced,
+)
+from maplab_py.frontend.imu_buffer import ImuInterval
 from maplab_py.frontend.mapping import Mapping
 from maplab_py.frontend.odometry_options import OdometryOptions
+from maplab_py.frontend.recorded_mission import RecordedMission
 from maplab_py.frontend.run_options import RunOptions
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.recordings.map_replay import MapRecording
+from maplab_py.sensors import Camera, Distortion, Imu, Projection
 from maplab_py.vimap.nav_state import NavState
 from tests.frontend.failing import blurred, covered, failing
 from tests.frontend.known_start import KnownStart
@@ -109,6 +119,103 @@ def test_samples_of_a_failed_part_are_those_of_the_states() -> None:
     assert (only[:, :3] == 9.0).all()
 
 
+_IMU = Imu("1" * 32, gravity_magnitude_mps2=9.81)
+_CAMERA = Camera(
+    "2" * 32, Projection.PINHOLE, Distortion.NONE, np.array([200.0, 200, 160, 120]), np.zeros(0), 320, 240
+)  # fmt: skip
+
+
+def _interval(frame: int, accel_gyro: np.ndarray) -> ImuInterval:
+    times_ns = np.linspace((frame - 1) * _FRAME_NS, frame * _FRAME_NS, len(accel_gyro))
+    return ImuInterval(times_ns.astype(np.int64), accel_gyro, _FRAME_NS // 10, 0)
+
+
+def _resting(rng: np.random.Generator) -> np.ndarray:
+    """Return samples (11, 6) of an IMU at rest."""
+    return np.array([0.0, 0, 9.81, 0, 0, 0]) + rng.normal(0.0, 1e-3, (11, 6))
+
+
+def _window(gyro_bias: float = 0.0) -> Any:
+    """Return a window of two frames at rest, with a bias about z."""
+    rng = np.random.default_rng(3)
+    p_M, motion = rng.uniform([-2, -1, 4], [2, 1, 8], (60, 3)), np.zeros((2, 9))
+    motion[:, 5] = gyro_bias
+    return SimpleNamespace(
+        states=SimpleNamespace(T_M_I=se3.identity(2), motion=motion), doubt_imu=lambda *_: None,
+        times_ns=np.array([0, _FRAME_NS]), landmarks=lambda: (np.arange(60), p_M),
+    )  # fmt: skip
+
+
+def _watch() -> SensorWatch:
+    device: Any = SimpleNamespace(cameras=(_CAMERA,), T_I_C=se3.identity(1))
+    return SensorWatch(device, _IMU)
+
+
+def test_a_gyroscope_with_another_bias_comes_back_and_stays() -> None:
+    rng, watch = np.random.default_rng(4), _watch()
+    p_M = _window().landmarks()[1]
+    frame: Any = SimpleNamespace(
+        camera=np.zeros(60, dtype=np.int32), track_id=np.arange(60),
+        uv_px=200.0 * p_M[:, :2] / p_M[:, 2:] + [160.0, 120.0],
+    )  # fmt: skip
+    for row in range(1, 200):
+        samples = _resting(rng)
+        samples[:, 5] += 0.1 if row > 80 else 0.0
+        # the window knows the bias as soon as the samples count again
+        frame.time_ns = row * _FRAME_NS
+        has_returned = bool(watch.failures) and not watch.failed
+        window = _window(0.1 if has_returned else 0.0)
+        interval, _ = watch.usable(_interval(row, samples), window)
+        assert bool(watch.failed) == (interval.accel_gyro[5, 5] != samples[5, 5])
+        watch.compare(frame, _interval(row, samples), window)
+    (failure,) = watch.failures
+    assert failure.sensor == "gyroscope"
+    assert failure.since_ns <= 80 * _FRAME_NS < failure.detected_ns < 100 * _FRAME_NS
+    assert failure.until_ns < 140 * _FRAME_NS
+    assert watch.notes(0)[0].endswith("the motion of the images; used with another bias since")
+
+
+def test_a_restart_ends_failures_of_the_imu() -> None:
+    rng, watch = np.random.default_rng(5), _watch()
+    for row in range(1, 40):
+        samples = _resting(rng)
+        if row >= 20:
+            samples[:, 4] = 0.05
+        used, failed = watch.usable(_interval(row, samples), _window())
+    assert failed == ImuPart.GYROSCOPE
+    np.testing.assert_allclose(used.accel_gyro[:, 3:], 0.0, atol=1e-12)
+    assert watch.status().startswith("gyroscope left out: y axis repeats")
+    watch.restart(40 * _FRAME_NS)
+    assert watch.failures[0].until_ns == 40 * _FRAME_NS
+    assert not watch.failed_between(41 * _FRAME_NS, 50 * _FRAME_NS)
+
+
+@pytest.mark.parametrize("has_new_bias", [True, False])
+def test_biases_of_a_map_go_on_after_a_failure(*, has_new_bias: bool) -> None:
+    mission, watch = RecordedMission(), _watch()
+    watch.failures.append(
+        SensorFailure("gyroscope", "biased", 25, 28, until_ns=40, has_new_bias=has_new_bias)
+    )
+    for row in range(
+        8
+    ):  # edges 2 and 3 have failed; from vertex 4 on the bias is known to be another
+        bias = np.array([0.0, 0.0, 0.01 if row < 3 else 0.05 if row < 4 else 0.11])
+        state = NavState.single(10 * row, se3.identity(), np.zeros(3), bias, np.full(3, 0.2 + row))
+        rate = 0.01 if row < 3 else 0.11
+        samples = np.array([[0.0, 0, 9.81, 0, 0, rate]] * 2)
+        if row:
+            mission.add_imu(np.array([10 * row - 10, 10 * row]), samples)
+        mission.add_vertex(state, (), ())
+    replace_failed(mission, watch, 9.81)
+    gyro_bias = [state.gyro_bias[0, 2] for state in mission.states]
+    after = 0.01 if has_new_bias else 0.11
+    np.testing.assert_allclose(gyro_bias, [0.01] * 5 + [after] * 3)
+    rates = [samples[:, 5].mean() for _, samples in mission.edges]
+    np.testing.assert_allclose(rates, [0.01] * 4 + [after] * 3)  # the device rests
+    accel_bias = [state.accel_bias[0, 0] for state in mission.states]
+    np.testing.assert_array_equal(accel_bias, 0.2 + np.arange(8))
+
+
 @pytest.mark.parametrize("kind", ["", "gyroscope biased", "accelerometer biased"])
 def test_an_imu_that_fails_does_not_bend_the_map(kind: str) -> None:
     vi_map, truth = replayed(REST_FIRST)
@@ -141,11 +248,16 @@ def test_an_imu_that_fails_does_not_bend_the_map(kind: str) -> None:
 
 
 def test_the_notes_tell_it() -> None:
-    from maplab_py.frontend.failures.watch import SensorFailure
-
     failure = SensorFailure("camera 1", "covered", 5_000_000_000, 5_400_000_000)
     assert failure.words(0) == "camera 1 left out from 5.0 s on: covered"
     back = dataclasses.replace(failure, until_ns=8_000_000_000)
     assert back.words(10**9) == "camera 1 left out from 4.0 s to 7.0 s: covered"
     used = dataclasses.replace(failure, is_used=True)
     assert used.words(0) == "camera 1 used for want of another from 5.0 s on: covered"
+
+
+def test_many_failures_are_counted() -> None:
+    watch = _watch()
+    watch.failures += [SensorFailure("gyroscope", "stuck", k, k, k + 1) for k in range(50)]
+    assert watch.notes(0)[-1] == "sensors were left out 42 more times"
+    assert len(watch.notes(0)) == 9
