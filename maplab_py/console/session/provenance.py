@@ -95,13 +95,9 @@ class Provenance:
         base: MapsState,
         result: MapsState,
         accuracy_of: Callable[[MapEntry], str],
-    ) -> None:
-        """Write the cards of the maps that a command has saved.
-
-        Raises:
-            OSError: One cannot be written.
-            RecursionError: Too many cards are within each other.
-        """
+    ) -> list[str]:
+        """Write the cards of the maps that a command has saved; return why some cannot be written."""
+        problems = []
         read, written = ({path.resolve() for path in paths} for paths in _paths_of(call))
         known = {id(entry.disk_copy) for entry in base.entries.values()}
         for entry in result.entries.values():
@@ -116,7 +112,11 @@ class Provenance:
             from maplab_py.console.session.cards import write_card  # with the libraries of saving
 
             outputs = tuple(dict.fromkeys(path for line in script for path in line.outputs))
-            write_card(entry, script_text(script), inputs, outputs, accuracy_of(entry))
+            try:
+                write_card(entry, script_text(script), inputs, outputs, accuracy_of(entry))
+            except (OSError, ValueError, RecursionError) as error:
+                problems.append(f"{copy.folder}: the card cannot be written: {error}")
+        return problems
 
 
 def script_text(script: Script) -> list[str]:

@@ -260,10 +260,8 @@ class Session:
         if call.is_trial:
             return report, base
         self.provenance.record(call, base, draft.maps.state)
-        try:
-            self.provenance.write_cards(call, base, draft.maps.state, self._accuracy_of)
-        except (OSError, ValueError, RecursionError) as error:
-            terminal.note(f"the card of the saved map cannot be written: {error}")
+        for problem in self.provenance.write_cards(call, base, draft.maps.state, self._accuracy_of):
+            terminal.note(problem)
         return report, draft.maps.state
 
     def _accuracy_of(self, entry: MapEntry) -> str:

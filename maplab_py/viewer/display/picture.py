@@ -24,7 +24,7 @@ from maplab_py.viewer.building import Subject
 from maplab_py.viewer.display import panel
 from maplab_py.viewer.display.camera import aim, aim_initially, view_of
 from maplab_py.viewer.display.parts import DARK_GROUND, LIGHT_GROUND, add_part
-from maplab_py.viewer.display.server import page_script
+from maplab_py.viewer.display.server import page_script, page_style
 from maplab_py.viewer.drawing import Drawing
 from maplab_py.viewer.history import MAX_STATES, error_curves, history_chart, state_layers
 from maplab_py.viewer.scene import Extent, Scene
@@ -281,6 +281,6 @@ def export_html(
         chooser=chooser,
     )
     end = page.rindex("</body>")
-    page = f"{page[:end]}{overlay}{_SCRIPT}{page_script()}{page[end:]}"
+    page = f"{page[:end]}{page_style()}{overlay}{_SCRIPT}{page_script()}{page[end:]}"
     write_text(path, [page], overwrite=True)
     return len(page.encode())

@@ -183,4 +183,4 @@ def test_a_card_that_cannot_be_written_leaves_the_map_saved(
     monkeypatch.setattr(SilentTerminal, "note", lambda _, text: notes.append(text))
     result = edited(plain, tmp_path / "result")
     assert len(load_map(result)[0].vertices)
-    assert notes[-1] == "the card of the saved map cannot be written: too deep"
+    assert notes[-1] == f"{result.resolve()}: the card cannot be written: too deep"

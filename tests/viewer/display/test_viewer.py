@@ -229,6 +229,7 @@ def test_an_export_has_all_layers_and_leaves_the_page_as_it_was(
     for layer in viewer.scene.layers:
         box = f"data-layer='{layer.name}'" + (" checked" if layer.is_visible else "")
         assert f"{box}>" in text
+    assert ".maplab-swipe {" in text  # its script draws the swipe line
 
 
 def _properties(control: Message) -> Message:
