@@ -136,7 +136,7 @@ def measure_integration(true_depth: VIMap, repeats: int = 3) -> dict[str, Integr
 def _integrate(depths: Any, poses: list[F64]) -> Integration:
     o = TRUE_OPTIONS
     settings = GridSettings(
-        VOXEL_M, o.truncation_m, o.min_ray_length_m, FAR_M, o.weight_depth_power, o.max_weight
+        VOXEL_M, 3.0 * VOXEL_M, o.min_ray_length_m, FAR_M, o.weight_depth_power, o.max_weight
     )
     grid = TsdfGrid(settings)
     cpu, wall = time.process_time(), time.perf_counter()
