@@ -15,9 +15,11 @@ from tests.support.data import shared_data
 pytestmark = pytest.mark.slow
 
 EUROC = (
-    "load_merge_all_submaps --maps_folder={euroc}; elq; kfh; optvi; relax; lc; optvi; "
-    "evaluate_trajectory --ground_truth={truth}"
+    "load_merge_all_submaps --maps_folder={euroc}; elq; kfh; optvi --ba_function_tolerance=1e-8; relax; lc; "
+    "optvi --ba_function_tolerance=1e-8; evaluate_trajectory --ground_truth={truth}"
 )
+"""Where optvi stops by default, the error after an alignment with scale still depends on the way by 0.12 mm
+of 10; at this tolerance by 0.01 mm."""
 MH_01 = (
     "rovioli {mh_01} --vio_rosbag_end_s=5; optvi; "
     "evaluate_trajectory --ground_truth={mh_01}/mav0/state_groundtruth_estimate0/data.csv"

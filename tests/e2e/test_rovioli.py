@@ -13,7 +13,7 @@ from tests.frontend.simulated import REST_FIRST, replayed
 pytestmark = pytest.mark.slow
 
 CTRL_C = "\x03"
-STATUS = re.compile(r"(\d+\.\d) s  \d+ tracks  \d+ landmarks  \d+ ms")
+STATUS = re.compile(r"(\d+\.\d) s  (?:\S+ x real time  )?\d+ tracks")
 MOVING_S = 3.0
 """By then the device moves, and the window has frames that are vertices."""
 
