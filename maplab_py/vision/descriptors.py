@@ -71,12 +71,14 @@ class Projected(NamedTuple):
     dimensions: int = 10
     spread: float = 1.0  # squared distance of a match, relative to Binary's
     coarseness: float = 1.0  # of the steps to which they are rounded
+    spread_of_fewer: float = 1.0  # like `spread`, in fewer dimensions
 
 
-_PROJECTED: dict[int, Projected] = {FeatureType.XFEAT: Projected(24, 1.25, 8.0)}
+_PROJECTED: dict[int, Projected] = {FeatureType.XFEAT: Projected(24, 1.25, 8.0, 0.75)}
 """Of 25 images in an eighth of the light (rendered rooms) XFeat localises 22 in a full map. In summary maps 5
 with 10 dimensions, 15 with 16, 21 with 24 and 32, and 24 with all 64, which takes four times as long; one is
-wrong from a spread of 1.7 on. Eight times coarser steps are signed bytes, at no loss."""
+wrong from a spread of 1.7 on, with 10 dimensions from 1 on, and none at 0.75. Eight times coarser steps are
+signed bytes, at no loss."""
 
 
 class DescriptorKind(NamedTuple):
@@ -161,4 +163,6 @@ class DescriptorKind(NamedTuple):
             squared_distance: That of Binary in 10 dimensions.
             dimensions: Dimensions; the noise grows with them.
         """
-        return squared_distance * self.projected.spread * dimensions / Projected().dimensions
+        own = self.projected
+        spread = own.spread_of_fewer if dimensions < own.dimensions else own.spread
+        return squared_distance * spread * dimensions / Projected().dimensions

@@ -62,6 +62,7 @@ def test_limits_are_in_the_unit_of_differences() -> None:
     xfeat = DescriptorKind(256, FeatureType.XFEAT, DescriptorDepth.FLOAT32)
     assert xfeat.largest(0.25, 0.45) == pytest.approx((0.6 * STEPS_PER_UNIT) ** 2)
     assert (SIFT.largest_projected(40.0, 10), xfeat.largest_projected(40.0, 24)) == (40.0, 120.0)
+    assert xfeat.largest_projected(40.0, 10) == 30.0  # a summary map from before
     assert (DescriptorKind(48).dimensions, SIFT.dimensions, FLOAT.dimensions) == (384, 128, 64)
     assert SIFT.words == "SIFT of 128 bytes"
 

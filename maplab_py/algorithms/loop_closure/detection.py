@@ -76,7 +76,7 @@ def detect(
         progress: Progress.
 
     Raises:
-        UserError: The chosen alignment does not exist.
+        UserError: The chosen alignment does not exist, or the matcher cannot be used.
         EstimationError: No descriptors, or too few tracks to learn their projection.
     """
     progress.step(0, 4, "features")
@@ -84,6 +84,10 @@ def detect(
     if options.projection_matrix_filename:
         given = load_projection(Path(options.projection_matrix_filename))
     features, used = _features(vi_map, missions, options, given, scope)
+    if options.matcher == "lighterglue":
+        from maplab_py.algorithms.loop_closure.second_matching import check_matcher
+
+        check_matcher(features.kind)
     # the queries' missions are always searched: they reveal ambiguous places
     rule = MatchRule(round(options.min_image_time_seconds * 1e9))
     progress.step(1, 4, "descriptor matches")

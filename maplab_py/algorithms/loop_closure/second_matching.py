@@ -11,12 +11,29 @@ import numpy as np
 from maplab_py.algorithms.loop_closure.candidates import Candidates, Matches
 from maplab_py.algorithms.loop_closure.features import MapFeatures
 from maplab_py.array_types import F32, I64
+from maplab_py.errors import UserError
 from maplab_py.progress import Progress
 from maplab_py.vimap import MissionSensor, VIMap, ragged_rows, starts_of_counts, to_hex
-from maplab_py.vision.descriptors import differences
+from maplab_py.vimap.descriptors import DescriptorDepth
+from maplab_py.vision.descriptors import DescriptorKind, differences
 from maplab_py.vision.features.learned.lighterglue import ImageKeypoints, installed_lighterglue
+from maplab_py.vision.features.learned.lighterglue_graph import DIMENSIONS
 
 _PAIRS_AT_ONCE = 64
+
+
+def check_matcher(kind: DescriptorKind) -> None:
+    """Check, before a search, that the network can match descriptors of a kind.
+
+    Raises:
+        UserError: It is not installed, or is for others.
+    """
+    if (kind.dimensions, kind.depth) != (DIMENSIONS, DescriptorDepth.FLOAT32):
+        raise UserError(
+            f"--lc_matcher=lighterglue: matches descriptors of {4 * DIMENSIONS} bytes, the map has "
+            f"{kind.words}: give --lc_matcher=nearest, or run extract_features"
+        )
+    installed_lighterglue()
 
 
 def match_again(

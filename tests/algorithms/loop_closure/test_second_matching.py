@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
+from maplab_py.algorithms.loop_closure.second_matching import check_matcher
 from maplab_py.algorithms.loop_closure.workflow import search_loops
 from maplab_py.array_types import I64
 from maplab_py.errors import FlagError, UserError
-from maplab_py.vimap.descriptors import FeatureType
+from maplab_py.vimap.descriptors import DescriptorDepth, FeatureType
+from maplab_py.vision.descriptors import DescriptorKind
 from maplab_py.vision.features.learned.lighterglue import ImageKeypoints
 from tests.algorithms.loop_closure.rooms import Walk, make_map
 from tests.support.float_features import with_numbers
@@ -75,6 +77,8 @@ def test_without_the_network_or_with_other_features_it_is_said(
         LoopClosureOptions(matcher="lighterglue")
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     vi_map = with_numbers(make_map([Walk(room=1), Walk(room=1, mission=1)])[0], FeatureType.XFEAT)
-    options = LoopClosureOptions(feature_type="XFeat", matcher="lighterglue", min_inlier_count=920)
+    options = LoopClosureOptions(feature_type="XFeat", matcher="lighterglue", min_inlier_count=1)
     with pytest.raises(UserError, match="LighterGlue is not installed on this computer"):
-        search_loops(vi_map, options)
+        search_loops(vi_map, options)  # though no candidate would be matched again
+    with pytest.raises(UserError, match=r"of 256 bytes, the map has XFeat of 64 bytes: give --lc"):
+        check_matcher(DescriptorKind(64, FeatureType.XFEAT, DescriptorDepth.UINT8))
