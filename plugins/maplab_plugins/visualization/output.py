@@ -125,7 +125,6 @@ def viewer_stop(context: CommandContext) -> Message:
     url = running_viewer(context).url
     context.session.watchers.remove(NAME)
     context.announce(NAME, "")
-    context.announce(NAME, "")
     return Message(f"the viewer at {url} has stopped")
 
 
