@@ -25,13 +25,12 @@ from maplab_py.array_types import F32, F64, U8
 from maplab_py.child_processes import SECONDS_BETWEEN_LOOKS, kill, start
 from maplab_py.errors import UserError
 from maplab_py.input_files import read_bytes
-from maplab_py.output_files import write_bytes
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
 from maplab_py.vision.features.learned.checkpoint import Arrays, read_checkpoint
 from maplab_py.vision.features.learned.lighterglue import ImageKeypoints, LighterGlue
 from maplab_py.vision.features.learned.lighterglue_graph import lighterglue_graph
-from maplab_py.vision.features.learned.networks import network_file
+from maplab_py.vision.features.learned.networks import install
 from maplab_py.vision.features.learned.xfeat import XFeat
 from maplab_py.vision.features.learned.xfeat_graph import xfeat_graph
 
@@ -100,8 +99,7 @@ def install_network(
         built.append((net, network, _check(net, network, name, is_published=is_published)))
     installed = []
     for net, network, check in built:
-        file = network_file(net.name.lower())
-        write_bytes(file, [network], overwrite=True)
+        file = install(net.name, network)
         installed.append(InstalledNetwork(net.name, check, len(network), file))
     licence = "Apache-2.0" if is_published else "that of the checkpoint"
     return InstalledFeatures(name, licence, tuple(installed))

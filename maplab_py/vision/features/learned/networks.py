@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 from maplab_py.errors import UserError
 from maplab_py.input_files import read_bytes
+from maplab_py.output_files import write_bytes
 
 _MAX_BYTES = 1 << 28
 _THREADS = 2
@@ -23,6 +24,15 @@ def network_file(name: str) -> Path:
     base = os.environ.get("XDG_DATA_HOME", "")
     folder = Path(base) if base else Path.home() / ".local" / "share"
     return folder / "maplab" / "networks" / f"{name}.onnx"
+
+
+def install(name: str, network: bytes) -> Path:
+    """Write a network into the user's data folder, and return its file; the next use opens it."""
+    file = network_file(name.lower())
+    with _lock:
+        write_bytes(file, [network], overwrite=True)
+        _opened.pop(file, None)
+    return file
 
 
 def installed(name: str, open_: Callable[[bytes, str], _T]) -> _T:

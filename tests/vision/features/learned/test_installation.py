@@ -114,7 +114,11 @@ def test_a_checkpoint_of_the_matcher_is_installed(tmp_path: Path) -> None:
     (tmp_path / "mine.pt").write_bytes(checkpoint(random_matcher_arrays()))
     (network,) = install_network("xfeat", tmp_path / "mine.pt").networks
     assert (network.network, network.file) == ("LighterGlue", network_file("lighterglue"))
-    assert len(installed_lighterglue().match([installation.check_keypoints()])) == 1
+    matcher = installed_lighterglue()
+    assert len(matcher.match([installation.check_keypoints()])) == 1
+    assert installed_lighterglue() is matcher
+    install_network("xfeat", tmp_path / "mine.pt")
+    assert installed_lighterglue() is not matcher
 
 
 def test_files_that_are_not_the_network(tmp_path: Path) -> None:
