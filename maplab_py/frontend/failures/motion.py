@@ -137,11 +137,14 @@ class MotionComparison:
             return None
         used = np.flatnonzero(is_known)
         used = used[:: 1 + len(used) // _MOST_POINTS]
-        camera, p_M, uv_px = frame.camera[used], snapshot.p_M[row[used]], frame.uv_px[used]
-        ray_C = np.empty((len(camera), 3))
+        ray_C, exists = np.empty((len(used), 3)), np.zeros(len(used), dtype=np.bool_)
         for number in cameras:
-            rows = camera == number
-            ray_C[rows], _ = self._tables[number].rays(uv_px[rows])
+            rows = frame.camera[used] == number
+            ray_C[rows], exists[rows] = self._tables[number].rays(frame.uv_px[used[rows]])
+        used, ray_C = used[exists], ray_C[exists]
+        if len(used) < _FEWEST_POINTS // 2:
+            return None
+        camera, p_M = frame.camera[used], snapshot.p_M[row[used]]
         T_I_C = self._T_I_C[camera]
         ray_I = so3.rotate(T_I_C[:, :4], ray_C)
         T_M_I = pose_by_rays(p_M, ray_I, T_I_C[:, 4:], T_M_I)

@@ -38,6 +38,9 @@ _LOST_SHARE, _LOST_NS = 0.2, 600_000_000
 """A camera that sees so small a share of the points of its leader, for so long, compared with before."""
 _MISFIT_RAD = 0.01
 """Points of a camera are so far from where those of all cameras are seen."""
+_RIGHT = 0.7
+"""Excess below which a camera agrees with the IMU, of MH_01 at most 0.53: at a failure of the IMU all are
+about as far off."""
 _SHIFTED = "its points do not fit: shifted on its mounting?"
 
 
@@ -251,15 +254,27 @@ class SensorWatch:
         ):
             return None
         alone = {row: self._comparison.compared(frozenset([row])) for row in cameras}
-        right = [r for r, each in alone.items() if each is not None and not self._is_unusual(each)]
-        wrong = [r for r, each in alone.items() if each is not None and self._is_unusual(each)]
+        excess = {r: self._excess(each) for r, each in alone.items() if each is not None}
+        right = [row for row, size in excess.items() if size < _RIGHT]
+        wrong = [row for row, size in excess.items() if size > 1.0]
         if len(right) == 0 or len(wrong) != 1:
             return None
         self._fail(f"camera {wrong[0]}", _SHIFTED, joint.since_ns, now_ns)
         return wrong[0]
 
     def _is_unusual(self, disagreement: Disagreement) -> bool:
-        return any(self._usual[part].excess(part, _of(disagreement, part)) > 1.0 for part in PARTS)
+        return self._excess(disagreement) > 1.0
+
+    def _excess(self, disagreement: Disagreement) -> float:
+        """Return the larger excess of the parts of the IMU that are whole; 0 without a gyroscope."""
+        if ImuPart.GYROSCOPE in self.failed:
+            return 0.0
+        counted = (
+            self._usual[part].excess(part, _of(disagreement, part))
+            for part in PARTS
+            if part not in self.failed and disagreement.since_ns >= self._usual[part].from_ns
+        )
+        return max(counted, default=0.0)
 
     def _judge(self, new: Disagreement, now_ns: int, smoother: FixedLagSmoother) -> None:
         """Leave parts of the IMU out, or take them back."""

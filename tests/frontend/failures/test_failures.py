@@ -146,18 +146,38 @@ def _window(gyro_bias: float = 0.0) -> Any:
     )  # fmt: skip
 
 
-def _watch() -> SensorWatch:
-    device: Any = SimpleNamespace(cameras=(_CAMERA,), T_I_C=se3.identity(1))
+def _watch(cameras: int = 1) -> SensorWatch:
+    device: Any = SimpleNamespace(cameras=(_CAMERA,) * cameras, T_I_C=se3.identity(cameras))
     return SensorWatch(device, _IMU)
 
 
-def test_a_gyroscope_with_another_bias_comes_back_and_stays() -> None:
-    rng, watch = np.random.default_rng(4), _watch()
+def _frame(cameras: int = 1) -> Any:
+    """Return a frame in which each camera sees the landmarks of the window."""
     p_M = _window().landmarks()[1]
-    frame: Any = SimpleNamespace(
-        camera=np.zeros(60, dtype=np.int32), track_id=np.arange(60),
-        uv_px=200.0 * p_M[:, :2] / p_M[:, 2:] + [160.0, 120.0],
+    uv_px = 200.0 * p_M[:, :2] / p_M[:, 2:] + [160.0, 120.0]
+    return SimpleNamespace(
+        camera=np.repeat(np.arange(cameras), 60), track_id=np.tile(np.arange(60), cameras),
+        uv_px=np.tile(uv_px, (cameras, 1)),
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["camera 1", "gyroscope"])
+def test_a_shifted_camera_is_told_from_a_wrong_gyroscope(kind: str) -> None:
+    rng, watch, frame, window = np.random.default_rng(6), _watch(2), _frame(2), _window()
+    for row in range(1, 100):
+        samples = _resting(rng)
+        if row == 81 and kind == "camera 1":
+            frame.uv_px[60:] += [7.0, 0.0]  # 2 deg
+        samples[:, 5] += 0.05 if row > 80 and kind == "gyroscope" else 0.0
+        frame.time_ns = row * _FRAME_NS
+        watch.usable(_interval(row, samples), window)
+        watch.compare(frame, _interval(row, samples), window)
+    assert [failure.sensor for failure in watch.failures] == [kind]
+    assert watch.left_out == (frozenset([1]) if kind == "camera 1" else frozenset())
+
+
+def test_a_gyroscope_with_another_bias_comes_back_and_stays() -> None:
+    rng, watch, frame = np.random.default_rng(4), _watch(), _frame()
     for row in range(1, 200):
         samples = _resting(rng)
         samples[:, 5] += 0.1 if row > 80 else 0.0
