@@ -21,6 +21,7 @@ from maplab_py.distinct import distinct
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3
 from maplab_py.progress import SILENT, Progress
+from maplab_py.report import counted
 from maplab_py.sensors import Extrinsics, OtherSensor, SensorSet
 from maplab_py.vimap import (
     MissionSensor,
@@ -109,7 +110,8 @@ def thin(
     else:
         raise UserError(
             f"--max_map_mb={options.max_map_mb:g} cannot be met: the map has {size:.3g} MB with "
-            f"{len(vi_map.vertices)} vertices and {len(vi_map.landmarks)} landmarks"
+            f"{counted(len(vi_map.vertices), 'vertex', 'vertices')} and "
+            f"{counted(len(vi_map.landmarks), 'landmark')}"
         )
     return vi_map, Thinned(
         landmarks_vanished=int(vanished.sum()),
