@@ -38,9 +38,6 @@ _LOST_SHARE, _LOST_NS = 0.2, 600_000_000
 """A camera that sees so small a share of the points of its leader, for so long, compared with before."""
 _MISFIT_RAD = 0.01
 """Points of a camera are so far from where those of all cameras are seen."""
-_RIGHT = 0.7
-"""Excess below which a camera agrees with the IMU, of MH_01 at most 0.53: at a failure of the IMU all are
-about as far off."""
 _SHIFTED = "its points do not fit: shifted on its mounting?"
 
 
@@ -255,7 +252,7 @@ class SensorWatch:
             return None
         alone = {row: self._comparison.compared(frozenset([row])) for row in cameras}
         excess = {r: self._excess(each) for r, each in alone.items() if each is not None}
-        right = [row for row, size in excess.items() if size < _RIGHT]
+        right = [row for row, size in excess.items() if size <= 1.0]
         wrong = [row for row, size in excess.items() if size > 1.0]
         if len(right) == 0 or len(wrong) != 1:
             return None
