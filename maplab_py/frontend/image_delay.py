@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from maplab_py.estimation.linear.threads import single_thread
-from maplab_py.estimation.window.frame import WindowFrame
+from maplab_py.estimation.window.frame import ImuPart, WindowFrame
 from maplab_py.frontend.initialization.gyro_bias import fit_turns, ray_pairs
 from maplab_py.frontend.initialization.rays import RayMaker
 from maplab_py.frontend.initialization.segment import History
@@ -55,6 +55,9 @@ class DelayMonitor:
 
     def push(self, frame: WindowFrame) -> bool:
         """Take a frame whose time has the delay applied; return whether another is to be applied."""
+        if ImuPart.GYROSCOPE in frame.failed:  # its turns follow from the frame before
+            self.reset()
+            return False
         self._history.push(frame)
         if self._history.duration_s < _SPAN_S - 5e-3:
             return False

@@ -327,9 +327,6 @@ class Odometry:
         if self._delays is None or update.tracks is not None:
             return False
         begin = time.perf_counter()
-        if ImuPart.GYROSCOPE in frame.failed:  # its turns follow from the frame before
-            self._delays.reset()
-            return False
         has_new_delay = self._delays.push(frame)
         update.stage_ms["delay"] = 1e3 * (time.perf_counter() - begin)
         return has_new_delay

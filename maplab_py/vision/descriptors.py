@@ -163,6 +163,7 @@ class DescriptorKind(NamedTuple):
             squared_distance: That of Binary in 10 dimensions.
             dimensions: Dimensions; the noise grows with them.
         """
-        own = self.projected
-        spread = own.spread_of_fewer if dimensions < own.dimensions else own.spread
+        stored = self.projected
+        is_fewer = dimensions < stored.dimensions
+        spread = stored.spread_of_fewer if is_fewer else stored.spread
         return squared_distance * spread * dimensions / Projected().dimensions

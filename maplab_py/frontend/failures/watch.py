@@ -31,7 +31,7 @@ _IN_ROW = 2
 _WHOLE_IN_ROW = 5
 """Comparisons that must agree with a constant bias until a part of the IMU is used again."""
 _MOST_RETURNS = 3
-_SETTLED_NS = 250_000_000
+_SETTLING_NS = 250_000_000
 """Time in which the window finds the bias of a part that is used again."""
 _MOST_NOTES = 8
 _LOST_SHARE, _LOST_NS = 0.2, 600_000_000
@@ -56,7 +56,7 @@ class SensorFailure:
 
     @property
     def fate(self) -> str:
-        """What becomes of the sensor."""
+        """Treatment of the sensor, in words."""
         return "used for want of another" if self.is_used else "left out"
 
     def words(self, zero_ns: int) -> str:
@@ -316,7 +316,7 @@ class SensorWatch:
         usual.recent.append(_of(new, part) + new.biases[part])
         if self._returns < _MOST_RETURNS and usual.agrees_with_a_bias(part):
             failure.has_new_bias = usual.has_new_bias(part)
-            usual.from_ns = now_ns + _SETTLED_NS
+            usual.from_ns = now_ns + _SETTLING_NS
             self._returns += 1
             self._return(failure.sensor, now_ns)
 
@@ -396,8 +396,8 @@ def replace_failed(mission: RecordedMission, watch: SensorWatch, gravity_mps2: f
     another bias, the difference is taken from its samples, for biases of a map change slowly.
     """
     # in the order of samples, of the accelerometer first
-    found = np.array([np.hstack([s.accel_bias[0], s.gyro_bias[0]]) for s in mission.states])
-    biases, change, before = found.copy(), np.zeros(6), ImuPart(0)
+    states = np.array([np.hstack([s.accel_bias[0], s.gyro_bias[0]]) for s in mission.states])
+    biases, change, before = states.copy(), np.zeros(6), ImuPart(0)
     for row, (times_ns, samples) in enumerate(mission.edges):
         from_ns = int(times_ns[0])
         failed = watch.failed_between(from_ns, int(times_ns[-1]))
@@ -406,8 +406,8 @@ def replace_failed(mission: RecordedMission, watch: SensorWatch, gravity_mps2: f
                 biases[row + 1, columns] = biases[row, columns]
                 continue
             if part in before and watch.has_new_bias(part, from_ns):
-                change[columns] = found[row, columns] - biases[row, columns]
-            biases[row + 1, columns] = found[row + 1, columns] - change[columns]
+                change[columns] = states[row, columns] - biases[row, columns]
+            biases[row + 1, columns] = states[row + 1, columns] - change[columns]
         before = failed
         if not failed and not change.any():
             continue
