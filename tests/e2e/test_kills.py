@@ -20,7 +20,7 @@ STEPS = (
 MADE: tuple[dict[str, int], ...] = ({}, {"m": 1}, {"n": 1}, {})
 """Unsaved maps with their numbers of missions after each of the steps."""
 KILL = "!kill -KILL $PPID"
-TERMINATE = "!kill -TERM $PPID && sleep 20"  # which the signal cuts short
+TERMINATE = "!kill -TERM $PPID && sleep 3"
 FAIL = "restore nothing"
 
 
