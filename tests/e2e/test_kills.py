@@ -20,7 +20,7 @@ STEPS = (
 MADE: tuple[dict[str, int], ...] = ({}, {"m": 1}, {"n": 1}, {})
 """Unsaved maps with their numbers of missions after each of the steps."""
 KILL = "!kill -KILL $PPID"
-TERMINATE = "!kill -TERM $PPID && sleep 3"
+TERMINATE = "!kill -TERM $PPID && sleep 1"
 FAIL = "restore nothing"
 
 
@@ -48,6 +48,16 @@ def test_what_a_script_has_made_can_be_loaded(
         return
     session.run("recover")
     assert {entry.key: len(entry.vi_map.missions) for entry in session.maps} == MADE[count - 1]
+
+
+def test_a_background_job_can_be_terminated(tmp_path: Path) -> None:
+    """Shells start such jobs with Ctrl-C ignored."""
+    (tmp_path / "s.maplab").write_text(TERMINATE)
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        assert run_program(tmp_path, "run", "s.maplab").returncode == 130
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_a_script_that_ends_well_leaves_no_copies(tmp_path: Path) -> None:

@@ -220,6 +220,8 @@ def terminations_as_interrupts() -> Iterator[None]:
         return
 
     def handle(signal_number: int, frame: FrameType | None) -> None:  # noqa: ARG001
+        if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # as in background jobs of shells
+            raise KeyboardInterrupt
         signal.raise_signal(signal.SIGINT)
 
     numbers = (getattr(signal, name, None) for name in ("SIGTERM", "SIGHUP"))
