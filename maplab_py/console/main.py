@@ -19,10 +19,8 @@ from maplab_py.console.commands.registry import Registry, load_registry
 from maplab_py.console.scripts.aliases import read_aliases
 from maplab_py.console.scripts.batch import read_batch, read_script, run_batch
 from maplab_py.console.scripts.runner import Runner
-from maplab_py.console.session.log import start_logging
-from maplab_py.console.session.paths import user_aliases, user_flagfile
+from maplab_py.console.session import log, paths, settings
 from maplab_py.console.session.session import Session
-from maplab_py.console.session.settings import Layer
 from maplab_py.console.session.status import Status
 from maplab_py.console.terminal import streams
 from maplab_py.console.terminal.foreground import abandoned_commands_run
@@ -166,7 +164,7 @@ def _main(argv: Sequence[str]) -> int:
         terminal.as_json = arguments.json
         if arguments.help or arguments.version:
             return _print_about(arguments)
-        start_logging()
+        log.start_logging()
         kernel_cache.tell_user = terminal.warning
         return int(_start(arguments, terminal))
     except UserError as error:
@@ -228,18 +226,18 @@ def make_runner(arguments: Arguments, terminal: ConsoleTerminal, registry: Regis
             configuration is only warned of, so that the console can be used to mend it.
     """
     session = Session(registry, terminal)
-    if user_flagfile().is_file():
+    if paths.user_flagfile().is_file():
         try:
-            session.settings.assign_file(user_flagfile(), Layer.USER_CONFIG)
+            session.settings.assign_file(paths.user_flagfile(), settings.Layer.USER_CONFIG)
         except FlagError as error:
             terminal.warning(str(error))
     try:
-        session.aliases.update(read_aliases(user_aliases()))
+        session.aliases.update(read_aliases(paths.user_aliases()))
     except UserError as error:
         terminal.warning(str(error))
     for path in arguments.flagfiles:
-        session.settings.assign_file(path, Layer.START_UP)
-    session.settings.assign(arguments.flags, Layer.START_UP, "start-up")
+        session.settings.assign_file(path, settings.Layer.START_UP)
+    session.settings.assign(arguments.flags, settings.Layer.START_UP, "start-up")
     return Runner(session, terminal)
 
 

@@ -16,14 +16,8 @@ from maplab_py.array_types import F64, I64, Mask, NDArray
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
 from maplab_py.input_files import LARGEST, read_foreign_text
+from maplab_py.interop import text_table
 from maplab_py.interop.stamps import POSES, read_stamps
-from maplab_py.interop.text_table import (
-    TextTable,
-    format_rows,
-    is_time_name,
-    read_text_table,
-    seconds_text,
-)
 from maplab_py.output_files import write_text
 from maplab_py.report import counted
 
@@ -111,7 +105,7 @@ def read_trajectory(
         MapError: The file cannot be read or is not a trajectory, two rows contradict each other, or there
             are positions only and `needs_orientation` is set; names file and line.
     """
-    table = read_text_table(path, POSES, unit=time_unit)
+    table = text_table.read_text_table(path, POSES, unit=time_unit)
     if LOCALIZED in table.header:
         table = table.take(table.values[:, table.header.index(LOCALIZED) - 1] > 0.0)
     trajectory = trajectory_of_table(table, keep_repeated=keep_repeated)[0]
@@ -127,7 +121,9 @@ def read_trajectory(
     return trajectory
 
 
-def trajectory_of_table(table: TextTable, *, keep_repeated: bool = False) -> tuple[Trajectory, I64]:
+def trajectory_of_table(
+    table: text_table.TextTable, *, keep_repeated: bool = False
+) -> tuple[Trajectory, I64]:
     """Return the trajectory of a table, and the row of the table of each pose.
 
     Raises:
@@ -247,8 +243,8 @@ def write_tum(trajectory: Trajectory, path: Path, *, overwrite: bool = False) ->
         UserError: The file exists and `overwrite` is not set, or it cannot be written.
     """
     T = trajectory.T_R_B
-    columns = [*seconds_text(trajectory.times_ns), T[:, 4:], T[:, :4]]
-    write_text(path, format_rows("%d.%09d" + " %.17g" * 7, columns), overwrite=overwrite)
+    columns = [*text_table.seconds_text(trajectory.times_ns), T[:, 4:], T[:, :4]]
+    write_text(path, text_table.format_rows("%d.%09d" + " %.17g" * 7, columns), overwrite=overwrite)
 
 
 def write_euroc(trajectory: Trajectory, path: Path, *, overwrite: bool = False) -> None:
@@ -264,13 +260,13 @@ def write_euroc(trajectory: Trajectory, path: Path, *, overwrite: bool = False) 
     header, width = _EUROC_HEADER, 7
     if len(given) == 3:
         columns, header, width = [*columns, *given], header + _EUROC_STATE_HEADER, 16
-    rows = format_rows("%d" + ",%.17g" * width, columns)
+    rows = text_table.format_rows("%d" + ",%.17g" * width, columns)
     write_text(
         path, (text for part in ([header + "\n"], rows) for text in part), overwrite=overwrite
     )
 
 
-def _columns(table: TextTable) -> dict[str, int]:
+def _columns(table: text_table.TextTable) -> dict[str, int]:
     """Return the place of each quantity ("px", "qw", "b_gx", ...) among the value columns.
 
     Raises:
@@ -298,7 +294,7 @@ def _columns(table: TextTable) -> dict[str, int]:
     return names
 
 
-def _named_columns(table: TextTable) -> dict[str, int]:
+def _named_columns(table: text_table.TextTable) -> dict[str, int]:
     """Return the columns that the header names; nothing without one.
 
     Names that tell the quantity come before those of an axis alone, as position.x before linear.x.
@@ -313,7 +309,7 @@ def _named_columns(table: TextTable) -> dict[str, int]:
         names = table.places(lambda name: _meaning(name, is_explicit=True))
         if "px" not in names:
             names = {**table.places(_meaning), **names}
-    if names and not is_time_name(table.header[0]):
+    if names and not text_table.is_time_name(table.header[0]):
         raise MapError(
             f"{table.source}: the first column must be the time stamp, not '{table.header[0]}'"
         )
@@ -328,13 +324,15 @@ def _meaning(name: str, *, is_explicit: bool = False) -> str:
     return _KINDS[(match[1] or "").replace("orientation quaternion", "q")] + match[2]
 
 
-def _optional(table: TextTable, names: dict[str, int], kind: str, quantity: str) -> F64 | None:
+def _optional(
+    table: text_table.TextTable, names: dict[str, int], kind: str, quantity: str
+) -> F64 | None:
     places = [names.get(f"{kind}{axis}") for axis in "xyz"]
     present = [place for place in places if place is not None]
     return table.columns(present, quantity) if len(present) == 3 else None
 
 
-def _refuse(table: TextTable, wrong: NDArray[np.bool_], reason: str) -> None:
+def _refuse(table: text_table.TextTable, wrong: NDArray[np.bool_], reason: str) -> None:
     if np.any(wrong):
         line = table.line_numbers[int(np.flatnonzero(wrong)[0])]
         raise MapError(f"{table.source}:{line}: {reason}")

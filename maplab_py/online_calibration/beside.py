@@ -23,11 +23,7 @@ from maplab_py.interop.recordings.protocol import Recording, TrackedFrame
 from maplab_py.online_calibration.options import OnlineCalibrationOptions
 from maplab_py.online_calibration.process import OPTIONS, Finish, Opening, Piece, Status, words
 from maplab_py.progress import Progress
-from maplab_py.sensors.calibration_transfer import (
-    Device,
-    corresponding_device,
-    with_calibration_of,
-)
+from maplab_py.sensors import calibration_transfer
 
 _MODULE = "maplab_py.online_calibration.child"
 _SIGNIFICANT_SIGMAS = 3.0
@@ -102,9 +98,12 @@ class CalibrationBeside:
         if options.apply != "next_start" or not options.proposal.is_file():
             return recording
         known = read_calibration(options.proposal)
-        device = Device(of_recording.imu_id, of_recording.rig_id)
-        sensors = with_calibration_of(
-            of_recording.sensors, device, known, corresponding_device(known, device)
+        device = calibration_transfer.Device(of_recording.imu_id, of_recording.rig_id)
+        sensors = calibration_transfer.with_calibration_of(
+            of_recording.sensors,
+            device,
+            known,
+            calibration_transfer.corresponding_device(known, device),
         )
         return RecalibratedRecording(
             recording,

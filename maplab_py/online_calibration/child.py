@@ -10,13 +10,7 @@ import os
 
 from maplab_py.child_processes import serve
 from maplab_py.errors import MaplabError
-from maplab_py.online_calibration.process import (
-    DeviceCalibration,
-    Finish,
-    Opening,
-    Piece,
-    Status,
-)
+from maplab_py.online_calibration import process
 
 _NICENESS = 10
 
@@ -26,18 +20,18 @@ class Answerer:
 
     def __init__(self) -> None:
         """Wait for the first request."""
-        self._calibration: DeviceCalibration | None = None
+        self._calibration: process.DeviceCalibration | None = None
 
-    def __call__(self, request: Opening | Piece | Finish) -> Status:
+    def __call__(self, request: process.Opening | process.Piece | process.Finish) -> process.Status:
         """Return the status after a request."""
         try:
-            if isinstance(request, Opening):
-                self._calibration = DeviceCalibration(request)
+            if isinstance(request, process.Opening):
+                self._calibration = process.DeviceCalibration(request)
                 return self._calibration.status()
             assert self._calibration is not None
             return self._calibration.answer(request)
         except MaplabError as error:
-            return Status(problem=str(error))
+            return process.Status(problem=str(error))
 
 
 if __name__ == "__main__":

@@ -11,15 +11,7 @@ import numpy as np
 
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
 from maplab_py.algorithms.landmarks.tracks import init_tracks
-from maplab_py.algorithms.self_calibration.changes import (
-    Contradiction,
-    Evidence,
-    evidence_of,
-    families,
-    joint_covariance,
-    strongest_contradiction,
-)
-from maplab_py.algorithms.self_calibration.checks import calibrate_with_checks
+from maplab_py.algorithms.self_calibration import changes, checks, reports
 from maplab_py.algorithms.self_calibration.device import transfer_calibration, with_device_of
 from maplab_py.algorithms.self_calibration.estimation.parameters import Parameters
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
@@ -28,7 +20,7 @@ from maplab_py.algorithms.self_calibration.pruning import (
     estimate_segment,
     test_segments,
 )
-from maplab_py.algorithms.self_calibration.reports import ParameterEstimate, SelfCalibrationReport
+from maplab_py.algorithms.self_calibration.segments import selection
 from maplab_py.algorithms.self_calibration.segments.database import (
     Key,
     SegmentDatabase,
@@ -36,12 +28,6 @@ from maplab_py.algorithms.self_calibration.segments.database import (
     load_database,
     locked_database,
     save_database,
-)
-from maplab_py.algorithms.self_calibration.segments.selection import (
-    Evaluation,
-    empty_database,
-    evaluate,
-    keep_best,
 )
 from maplab_py.array_types import F64
 from maplab_py.errors import EstimationError, MaplabError
@@ -55,12 +41,8 @@ from maplab_py.online_calibration.suggestions import (
 )
 from maplab_py.output_files import write_text
 from maplab_py.progress import SILENT
-from maplab_py.sensors import SensorSet
-from maplab_py.sensors.calibration_transfer import Device, only_device, with_calibration_of
-from maplab_py.sensors.sensors_yaml import write_sensors
-from maplab_py.vimap import VIMap, to_hex
-from maplab_py.vimap.excerpts import with_ids_of_times
-from maplab_py.vimap.merge import stack
+from maplab_py.sensors import SensorSet, calibration_transfer, sensors_yaml
+from maplab_py.vimap import VIMap, excerpts, merge, to_hex
 
 OPTIONS = SelfCalibrationOptions(keep_unobservable_at_prior=True)
 _SEGMENTS_AT_ONCE = 5
@@ -99,9 +81,9 @@ class Status:
     evaluated: int = 0
     kept: int = 0  # segments in the database
     processor_s: float = 0.0  # of all requests
-    contradiction: Contradiction | None = None  # the strongest so far, if significant
+    contradiction: changes.Contradiction | None = None  # the strongest so far, if significant
     missing: str = ""  # segments and motion until the wanted deviations
-    proposal: SelfCalibrationReport | None = None
+    proposal: reports.SelfCalibrationReport | None = None
     problem: str = ""
 
 
@@ -110,8 +92,8 @@ class _Segment:
     """A segment of this session."""
 
     piece: Piece
-    evaluation: Evaluation  # of it alone, at the calibration of the database
-    evidence: Evidence | None
+    evaluation: selection.Evaluation  # of it alone, at the calibration of the database
+    evidence: changes.Evidence | None
 
     @property
     def covariance(self) -> F64:
@@ -134,12 +116,12 @@ class DeviceCalibration:
         self._database = database if database is not None and len(database) else None
         self._earlier: dict[Key, F64] = {}  # covariances of the database's segments
         self._session: list[_Segment] = []  # all of them that may still be kept
-        self._evidence: list[Evidence] = []
+        self._evidence: list[changes.Evidence] = []
         self._unwritten, self._evaluated = 0, 0
         self._parameters, self._tolerance = Parameters(()), np.zeros(0)
         self._library: dict[str, F64] | None = None
-        self._contradiction: Contradiction | None = None
-        self._proposal: SelfCalibrationReport | None = None
+        self._contradiction: changes.Contradiction | None = None
+        self._proposal: reports.SelfCalibrationReport | None = None
         self._calibrated: frozenset[Key] = frozenset()
         self._problem = ""
 
@@ -179,13 +161,13 @@ class DeviceCalibration:
         source = segment
         if self._database is not None:
             source = with_device_of(segment, self._database.vi_map)
-        evaluation = evaluate(source, OPTIONS)
+        evaluation = selection.evaluate(source, OPTIONS)
         self._evaluated += 1
         if len(evaluation.parameters) > len(self._parameters):
             self._parameters = evaluation.parameters
             self._tolerance = wanted_sigma(segment, OPTIONS, self._options.wanted)
         if estimate is not None and len(estimate.parameters) == len(self._parameters):
-            evidence = evidence_of(estimate, int(time_ns[0]), int(time_ns[-1]))
+            evidence = changes.evidence_of(estimate, int(time_ns[0]), int(time_ns[-1]))
             self._evidence.append(evidence)
         if len(evaluation.parameters) == len(self._parameters):
             self._session.append(_Segment(piece, evaluation, evidence))
@@ -198,7 +180,7 @@ class DeviceCalibration:
 
     def _look_for_contradiction(self) -> None:
         """Compare the newest segments with the calibration; the first time is kept."""
-        new = strongest_contradiction(self._evidence, self._parameters, self._tolerance)
+        new = changes.strongest_contradiction(self._evidence, self._parameters, self._tolerance)
         if new is None or not new.is_significant:
             return
         old = self._contradiction
@@ -219,10 +201,10 @@ class DeviceCalibration:
                     [np.sqrt(np.diag(each.covariance)) for each in self._session], axis=0
                 )
                 vi_map = self._session[0].evaluation.vi_map
-                database = empty_database(vi_map, self._parameters, reference, OPTIONS)
+                database = selection.empty_database(vi_map, self._parameters, reference, OPTIONS)
             records = [self._record(each, database) for each in self._session]
             whole = _map_of([each.piece for each in self._session], self._device)
-            database, _ = keep_best(database, whole, self._parameters, records, OPTIONS)
+            database, _ = selection.keep_best(database, whole, self._parameters, records, OPTIONS)
             save_database(database, self._path)
         kept = {record.key for record in database.records}
         pairs = zip(self._session, records, strict=True)
@@ -244,7 +226,7 @@ class DeviceCalibration:
         ]
         if since_ns is None:
             known += self._covariances_of_database()
-        return joint_covariance(known, self._parameters.prior_sigma)
+        return changes.joint_covariance(known, self._parameters.prior_sigma)
 
     def _covariances_of_database(self) -> list[F64]:
         """Return the covariances (k, k) that the segments of earlier sessions leave alone."""
@@ -255,7 +237,7 @@ class DeviceCalibration:
         earlier = [record for record in database.records if record.mission not in here]
         for record in earlier:
             if record.key not in self._earlier:
-                evaluation = evaluate(database.map_of(record), OPTIONS)
+                evaluation = selection.evaluate(database.map_of(record), OPTIONS)
                 self._earlier[record.key] = evaluation.segments[0].covariance
         covariances = (self._earlier[record.key] for record in earlier)
         return [each for each in covariances if len(each) == len(self._parameters)]
@@ -264,7 +246,7 @@ class DeviceCalibration:
         """Return whether the new value of what is contradicted is known as well as wanted."""
         if self._contradiction is None:
             return False
-        rows = families(self._parameters)[self._contradiction.family]
+        rows = changes.families(self._parameters)[self._contradiction.family]
         sigma = np.sqrt(np.diag(self._covariance()))
         return bool(np.all(sigma[rows] <= self._tolerance[rows]))
 
@@ -274,7 +256,7 @@ class DeviceCalibration:
             return ""
         covariance, rows = self._covariance(), np.arange(len(self._parameters))
         if self._contradiction is not None:
-            rows = families(self._parameters)[self._contradiction.family]
+            rows = changes.families(self._parameters)[self._contradiction.family]
         if np.all(np.sqrt(np.diag(covariance))[rows] <= self._tolerance[rows]):
             return ""
         if self._library is None:
@@ -313,15 +295,15 @@ class DeviceCalibration:
         assert database is not None
         valid = self._valid_segments(database)
         vi_map = transfer_calibration(valid.vi_map, self._device.sensors)
-        sensors, _, report = calibrate_with_checks(
+        sensors, _, report = checks.calibrate_with_checks(
             vi_map, OPTIONS, max_camera_shift_m=_MAX_CAMERA_SHIFT_M, batch=True
         )
         report = dataclasses.replace(report, segments=len(valid))
-        calibrated = with_calibration_of(
+        calibrated = calibration_transfer.with_calibration_of(
             self._device.sensors,
-            Device(self._device.imu_id, self._device.rig_id),
+            calibration_transfer.Device(self._device.imu_id, self._device.rig_id),
             sensors,
-            only_device(sensors),
+            calibration_transfer.only_device(sensors),
         )
         write_proposal(self._options, calibrated, report)
         self._proposal = report
@@ -344,7 +326,7 @@ class DeviceCalibration:
             return database
         new = database.with_only(recent)
         vi_map = transfer_calibration(new.vi_map, self._device.sensors)
-        sensors, _, _ = calibrate_with_checks(
+        sensors, _, _ = checks.calibrate_with_checks(
             vi_map, OPTIONS, max_camera_shift_m=_MAX_CAMERA_SHIFT_M, batch=True
         )
         before = database.with_only({record.key for record in database.records} - recent)
@@ -393,12 +375,12 @@ def _map_of(pieces: list[Piece], device: RecordedSensors) -> VIMap:
         edges = vi_map.imu_edges
         vi_map = vi_map.replace(imu_edges=edges.take(np.flatnonzero(edges.sample_count > 0)))
         vi_map, _ = init_tracks(vi_map, LandmarkQualityOptions(), across_cameras=True)
-        maps.append(with_ids_of_times(vi_map, session))
-    return functools.reduce(stack, maps)
+        maps.append(excerpts.with_ids_of_times(vi_map, session))
+    return functools.reduce(merge.stack, maps)
 
 
 def write_proposal(
-    options: OnlineCalibrationOptions, sensors: SensorSet, report: SelfCalibrationReport
+    options: OnlineCalibrationOptions, sensors: SensorSet, report: reports.SelfCalibrationReport
 ) -> None:
     """Write a calibration as sensors.yaml that begins with values and deviations.
 
@@ -408,11 +390,11 @@ def write_proposal(
     lines = [f"# calibration by {report.segments} segments of {options.database}"]
     lines += [f"# {words(estimate)}; {estimate.verdict}" for estimate in report.parameters]
     lines += [f"# not observable: {name}" for name in report.unobservable]
-    text = "\n".join(lines) + "\n" + write_sensors(sensors)
+    text = "\n".join(lines) + "\n" + sensors_yaml.write_sensors(sensors)
     write_text(options.proposal, [text], overwrite=True)
 
 
-def words(estimate: ParameterEstimate) -> str:
+def words(estimate: reports.ParameterEstimate) -> str:
     """Return an estimate in words."""
     unit = f" {estimate.unit}" if estimate.unit else ""
     return (

@@ -22,6 +22,7 @@ from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
 from maplab_py.sensors import ImuIntrinsics, SensorSet
 from maplab_py.sensors.calibration_transfer import Device, only_device
+from maplab_py.simulation import scene, session, trajectory_motion
 from maplab_py.simulation import sensors as simulated
 from maplab_py.simulation.recording import SessionSeeds, record
 from maplab_py.simulation.scenario import (
@@ -34,9 +35,6 @@ from maplab_py.simulation.scenario import (
     SessionOptions,
     WorldOptions,
 )
-from maplab_py.simulation.scene import make_appearance, make_session_appearance
-from maplab_py.simulation.session import session_map
-from maplab_py.simulation.trajectory_motion import KNOT_SPACING_S, through
 from maplab_py.simulation.world import make_world
 from maplab_py.vimap import VIMap
 
@@ -248,20 +246,20 @@ def simulated_segment(
     rig = dataclasses.replace(rigs, T_B_C=sensors.T_I_C(*device))
     imu = sensors.imu(device.imu)
     of_scenario = simulated.Device(sensors, device.imu, rig, rig, imu.intrinsics or ImuIntrinsics())
-    count = int(scenario.sessions[0].total_s / KNOT_SPACING_S) + 3
+    count = int(scenario.sessions[0].total_s / trajectory_motion.KNOT_SPACING_S) + 3
     place = np.array([0.5 * _ROOM_M[0] - motion.wall_m, 0.0, _HEIGHT_M])
     T_G_C0 = se3.make(so3.from_matrix(_R_G_C), place)
-    time_s: F64 = np.asarray(KNOT_SPACING_S * np.arange(count), dtype=np.float64)
+    time_s: F64 = np.asarray(trajectory_motion.KNOT_SPACING_S * np.arange(count), dtype=np.float64)
     T_C0_C = motion.poses(time_s)
     T_G_I = se3.compose(se3.compose(T_G_C0, T_C0_C), se3.inverse(rig.T_B_C[0]))
     generators = np.random.default_rng(seed).spawn(5)
     seeds = SessionSeeds(*generators)
-    look = make_session_appearance(
-        make_appearance(scenario.appearance, world.look, generators[2]), generators[2]
+    look = scene.make_session_appearance(
+        scene.make_appearance(scenario.appearance, world.look, generators[2]), generators[2]
     )
-    spline = through(T_G_I, KNOT_SPACING_S)
+    spline = trajectory_motion.through(T_G_I, trajectory_motion.KNOT_SPACING_S)
     recording = record(scenario, 0, world, of_scenario, look, seeds, spline)
-    return session_map(scenario, world, of_scenario, recording, seeds)[0]
+    return session.session_map(scenario, world, of_scenario, recording, seeds)[0]
 
 
 def _scenario(sensors: SensorSet, device: Device, keyframes: int) -> Scenario:

@@ -10,14 +10,7 @@ from numpy.typing import NDArray
 from maplab_py.errors import UserError
 from maplab_py.plotting import figure as figures
 from maplab_py.report import counted
-from maplab_py.vimap import LandmarkQuality, VIMap
-from maplab_py.vimap.queries import (
-    coobservation_counts,
-    limits_from_above,
-    mission_labels,
-    mission_mask,
-    observation_counts,
-)
+from maplab_py.vimap import LandmarkQuality, VIMap, queries
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,11 +37,11 @@ def trajectories(
     Raises:
         UserError: There are no vertices to draw.
     """
-    chosen = np.flatnonzero(mission_mask(vi_map, missions))
+    chosen = np.flatnonzero(queries.mission_mask(vi_map, missions))
     mission, p_G_I = vi_map.vertices.mission, vi_map.T_G_I[:, 4:]
     if not np.isin(mission, chosen).any():
         raise UserError("the map has no vertices to draw")
-    low, high = limits_from_above(vi_map, chosen)
+    low, high = queries.limits_from_above(vi_map, chosen)
     if p_G_truth is not None:
         low = np.minimum(low, p_G_truth[:, :2].min(axis=0))
         high = np.maximum(high, p_G_truth[:, :2].max(axis=0))
@@ -61,7 +54,7 @@ def trajectories(
         axes.plot(*p_G_truth[:, :2].T, color="black", linewidth=0.8, label="truth")
     for row in chosen:
         x, y = p_G_I[mission == row, :2].T
-        name = mission_labels(vi_map)[row]
+        name = queries.mission_labels(vi_map)[row]
         axes.plot(x, y, color=figures.mission_colour(int(row)), linewidth=1.5, label=name)
         axes.plot(x[:1], y[:1], "o", color=figures.mission_colour(int(row)), markersize=5)
     axes.set_xlim(low[0], high[0])
@@ -89,10 +82,12 @@ def landmark_histograms(vi_map: VIMap, missions: NDArray[np.int64] | None = None
     Raises:
         UserError: There are no landmarks.
     """
-    chosen = mission_mask(vi_map, missions)[vi_map.vertices.mission[vi_map.landmarks.vertex]]
+    chosen = queries.mission_mask(vi_map, missions)[
+        vi_map.vertices.mission[vi_map.landmarks.vertex]
+    ]
     if not chosen.any():
         raise UserError("the map has no landmarks to draw")
-    counts = observation_counts(vi_map)[chosen]
+    counts = queries.observation_counts(vi_map)[chosen]
     distance_m = np.linalg.norm(vi_map.landmarks.p_I[chosen], axis=1)
     quality = vi_map.landmarks.quality[chosen]
     figure = figures.new_figure(11.0, 3.6)
@@ -119,8 +114,8 @@ def coobservability(vi_map: VIMap) -> Figure:
     """
     if not len(vi_map.missions):
         raise UserError("the map has no missions to draw")
-    counts = coobservation_counts(vi_map)
-    names = mission_labels(vi_map)
+    counts = queries.coobservation_counts(vi_map)
+    names = queries.mission_labels(vi_map)
     size_in = 3.5 + 0.45 * min(len(names), 40)
     figure = figures.new_figure(size_in + 1.0, size_in)
     axes = figure.subplots()

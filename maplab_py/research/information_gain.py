@@ -10,10 +10,7 @@ import numpy as np
 from maplab_py.algorithms.self_calibration.estimation.problem import build_segment_problem
 from maplab_py.algorithms.self_calibration.estimation.solution import solve
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
-from maplab_py.algorithms.self_calibration.segments.splitting import (
-    extract_submap,
-    split_into_segments,
-)
+from maplab_py.algorithms.self_calibration.segments import splitting
 from maplab_py.algorithms.self_calibration.uncertainty import posterior_covariance
 from maplab_py.algorithms.vi_optimization.solution import with_estimated_sensors
 from maplab_py.array_types import I64, NDArray
@@ -46,12 +43,12 @@ def select_by_gain(
     Raises:
         UserError: No segment has enough information.
     """
-    candidates = split_into_segments(vi_map, missions, options.segment_keyframes)
+    candidates = splitting.split_into_segments(vi_map, missions, options.segment_keyframes)
     selected: list[I64] = []
     sensors, before = vi_map.sensors, 0.0
     for number, rows in enumerate(candidates):
         progress.step(number, len(candidates), "calibrate with every candidate")
-        joint = extract_submap(vi_map, np.unique(np.concatenate([*selected, rows])))
+        joint = splitting.extract_submap(vi_map, np.unique(np.concatenate([*selected, rows])))
         problem = build_segment_problem(joint.replace(sensors=sensors), options)
         states, _ = solve(problem, options)
         scale = problem.parameters.prior_sigma

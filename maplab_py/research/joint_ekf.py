@@ -15,14 +15,10 @@ import time
 
 import numpy as np
 
-from maplab_py.algorithms.self_calibration.calibration import parameter_estimates
-from maplab_py.algorithms.self_calibration.device import device_of
-from maplab_py.algorithms.self_calibration.estimation.imu_interpolation import (
-    correct_interpolation_bias,
-)
+from maplab_py.algorithms.self_calibration import calibration, device, reports
+from maplab_py.algorithms.self_calibration.estimation import imu_interpolation
 from maplab_py.algorithms.self_calibration.estimation.parameters import parameters_of
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
-from maplab_py.algorithms.self_calibration.reports import SelfCalibrationReport
 from maplab_py.algorithms.self_calibration.uncertainty import Uncertainty, name_directions, spectrum
 from maplab_py.algorithms.vi_optimization import calibration_states
 from maplab_py.array_types import F64, I64, NDArray
@@ -31,14 +27,8 @@ from maplab_py.estimation.blocks import ParameterBlocks
 from maplab_py.estimation.imu import inertial_data, preintegration
 from maplab_py.estimation.linear.threads import single_blas_thread
 from maplab_py.estimation.states import States
+from maplab_py.estimation.terms import inertial_calibration
 from maplab_py.estimation.terms.cameras import EXTRINSICS, camera_blocks
-from maplab_py.estimation.terms.inertial_calibration import (
-    ACCEL,
-    GYRO,
-    ROTATION,
-    imu_blocks,
-    intrinsics_of,
-)
 from maplab_py.geometry import se3, so3
 from maplab_py.progress import SILENT, Progress
 from maplab_py.research.ekf_tracks import TrackResiduals, linearised, tracks_of
@@ -47,7 +37,11 @@ from maplab_py.vimap import VIMap
 
 WINDOW = 20
 """Poses in the sliding window."""
-_IMU_COLUMNS = {GYRO: 0, ACCEL: 6, ROTATION: 12}
+_IMU_COLUMNS = {
+    inertial_calibration.GYRO: 0,
+    inertial_calibration.ACCEL: 6,
+    inertial_calibration.ROTATION: 12,
+}
 _FIRST_CAMERA = 15
 _TILT, _VELOCITY, _GYRO_BIAS, _ACCEL_BIAS = np.deg2rad(1.0), 0.3, 0.02, 0.3
 """Deviations of the state of the first vertex [rad, m/s, rad/s, m/s^2]."""
@@ -71,9 +65,9 @@ def filter_jointly(
         MapError: Calibrations are missing.
         UserError: The missions were recorded with different devices.
     """
-    device_of(vi_map, missions)
+    device.device_of(vi_map, missions)
     if options.imu_curvature:
-        vi_map = correct_interpolation_bias(vi_map)
+        vi_map = imu_interpolation.correct_interpolation_bias(vi_map)
     rows = np.arange(len(vi_map.missions)) if missions is None else np.asarray(missions)
     result = JointFilter(vi_map, rows.astype(np.int64), options)
     with single_blas_thread():
@@ -106,13 +100,13 @@ class JointFilter:
         self.changes: list[F64] = []
         self.seconds = 0.0
         self._edge_to = {int(to): row for row, to in enumerate(vi_map.imu_edges.to_vertex)}
-        imu_id, rig_id = device_of(vi_map, missions)
+        imu_id, rig_id = device.device_of(vi_map, missions)
         self._imu = vi_map.sensors.imu(imu_id)
         self._rig = calibration_states.rig_cameras(vi_map, missions)
         self._cameras = vi_map.sensors.camera_rig(rig_id).cameras
         blocks = [
             *camera_blocks(self._rig.cameras, self._rig.timing_s[:, 0]),
-            *imu_blocks((self._imu,)),
+            *inertial_calibration.imu_blocks((self._imu,)),
         ]
         self.before = self.blocks = ParameterBlocks(blocks)
         kept = options.estimated() - {"intrinsics", "time_offset", "line_delay"}
@@ -181,7 +175,9 @@ class JointFilter:
         if edge < 0:
             raise EstimationError("the filter needs an inertial edge between all vertices")
         data = inertial_data.InertialData.of_map(self._map, np.array([edge]))
-        imu = dataclasses.replace(self._imu, intrinsics=intrinsics_of(self.blocks)[0])
+        imu = dataclasses.replace(
+            self._imu, intrinsics=inertial_calibration.intrinsics_of(self.blocks)[0]
+        )
         made = preintegration.integrate(
             dataclasses.replace(data, imus=(imu,)),
             self.gyro_bias,
@@ -321,13 +317,15 @@ class JointFilter:
         sensors = calibration_states.with_cameras(self._map.sensors, self._rig, states)
         return calibration_states.with_imus(sensors, (self._imu,), states)
 
-    def report(self) -> SelfCalibrationReport:
+    def report(self) -> reports.SelfCalibrationReport:
         """Return the report, without costs and iterations."""
         parameters = self.parameters
         uncertainty = Uncertainty(parameters.prior_sigma, self.covariance)
         directions = spectrum(self.covariance, parameters).unobservable()
-        return SelfCalibrationReport(
-            parameters=parameter_estimates(parameters, self.before, self.change, uncertainty),
+        return reports.SelfCalibrationReport(
+            parameters=calibration.parameter_estimates(
+                parameters, self.before, self.change, uncertainty
+            ),
             unobservable=name_directions(directions, parameters),
             without_scale=(),
             segments=0,
@@ -357,9 +355,9 @@ def _column(block: str, row: int, column: int) -> int:
 def _move(blocks: ParameterBlocks, step: F64) -> ParameterBlocks:
     """Apply a step of the calibration states."""
     by_block = {
-        GYRO: step[None, 0:6],
-        ACCEL: step[None, 6:12],
-        ROTATION: step[None, 12:15],
+        inertial_calibration.GYRO: step[None, 0:6],
+        inertial_calibration.ACCEL: step[None, 6:12],
+        inertial_calibration.ROTATION: step[None, 12:15],
         EXTRINSICS: step[_FIRST_CAMERA:].reshape(-1, 6),
     }
     return ParameterBlocks(

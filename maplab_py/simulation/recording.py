@@ -11,12 +11,10 @@ from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
 from maplab_py.interop.imu_csv import read_imu_csv
-from maplab_py.simulation import scene, trajectory_motion
-from maplab_py.simulation.detection import CameraPoses, Detections, detect
+from maplab_py.simulation import detection, scene, sensors, trajectory_motion
 from maplab_py.simulation.imu import ImuRecording, measure
 from maplab_py.simulation.motion import check_free_way, motion_spline
 from maplab_py.simulation.scenario import Scenario, SessionOptions
-from maplab_py.simulation.sensors import Device, DriftedStates, drift
 from maplab_py.simulation.spline import MotionState, PoseSpline
 from maplab_py.simulation.world import World
 
@@ -41,12 +39,12 @@ class Recording:
 
     time_ns: I64  # (V,)
     motion: MotionState
-    states: DriftedStates
+    states: sensors.DriftedStates
     imu_time_ns: I64  # (S,) of all samples
     imu_motion: MotionState  # at all samples
     imu: ImuRecording  # of all samples
     imu_row: I64  # (V,) sample at the vertex
-    keypoints: Detections  # of all cameras; `frame` counts vertex * cameras + camera
+    keypoints: detection.Detections  # of all cameras; `frame` counts vertex * cameras + camera
     descriptors: NDArray[np.uint8]
     spline: PoseSpline  # the true motion
     frame_s: F64  # (V,) time of the images on the spline
@@ -56,7 +54,7 @@ def record(
     scenario: Scenario,
     number: int,
     world: World,
-    device: Device,
+    device: sensors.Device,
     appearance: scene.SessionAppearance,
     seeds: SessionSeeds,
     spline: PoseSpline | None = None,
@@ -90,7 +88,9 @@ def record(
         clock, imu = _Clock.of_samples(scenario, samples.time_s, lead_s), samples.imu
     imu_motion = spline.evaluate(clock.sample_s + clock.lead_s)
     motion = spline.evaluate(clock.sample_s[clock.frame_row] + clock.lead_s)
-    states = drift(scenario.drift, motion, clock.sample_s[clock.frame_row], seeds.measurement)
+    states = sensors.drift(
+        scenario.drift, motion, clock.sample_s[clock.frame_row], seeds.measurement
+    )
     detections = _detect_all(scenario, world, device, spline, clock, appearance, seeds)
     kept, stamp_ns = _stamps(scenario, clock, seeds.other)
     gap_ns = round(scenario.changes.days_between_sessions * 86_400e9) or _SESSION_GAP_NS
@@ -165,12 +165,12 @@ def _stamps(scenario: Scenario, clock: _Clock, rng: np.random.Generator) -> tupl
 def _detect_all(
     scenario: Scenario,
     world: World,
-    device: Device,
+    device: sensors.Device,
     spline: PoseSpline,
     clock: _Clock,
     appearance: scene.SessionAppearance,
     seeds: SessionSeeds,
-) -> Detections:
+) -> detection.Detections:
     """Detect with every camera; images and tracks are numbered over all cameras."""
     cameras = device.true_rig.cameras
     time_s = clock.sample_s[clock.frame_row] + clock.lead_s
@@ -183,18 +183,18 @@ def _detect_all(
             return se3.compose(spline.evaluate(time).T_G_I, T_I_C)
 
         delay = scenario.cameras[row].line_delay_s
-        poses = CameraPoses(time_s, se3.compose(T_G_I, T_I_C), delay, at_time)
-        detections = detect(
+        poses = detection.CameraPoses(time_s, se3.compose(T_G_I, T_I_C), delay, at_time)
+        detections = detection.detect(
             camera, poses, world, appearance.is_there, scenario.measurement, seeds.measurement
         )
         track = np.where(detections.track >= 0, detections.track + tracks, -1)
         tracks = max(tracks, int(track.max(initial=-1)) + 1)
         frame = detections.frame * len(cameras) + row
         parts.append(dataclasses.replace(detections, frame=frame, track=track))
-    names = [field.name for field in dataclasses.fields(Detections)]
+    names = [field.name for field in dataclasses.fields(detection.Detections)]
     joined = {n: np.concatenate([getattr(part, n) for part in parts]) for n in names}
     order = np.argsort(joined["frame"], kind="stable")
-    return Detections(**{n: column[order] for n, column in joined.items()})
+    return detection.Detections(**{n: column[order] for n, column in joined.items()})
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -12,22 +12,16 @@ from maplab_py.errors import MapError
 from maplab_py.report import counted
 from maplab_py.storage import extension_fields
 from maplab_py.storage import maplab_map_pb2 as pb
+from maplab_py.storage.protobuf import map_files
 from maplab_py.storage.protobuf.ids import ids_of, unknown_bytes
-from maplab_py.storage.protobuf.map_files import (
-    COPY_AGAIN,
-    METADATA,
-    RESOURCE_INFO,
-    SENSORS,
-    FileKind,
-)
 from maplab_py.storage.protobuf.tables_from_messages import Content
 from maplab_py.vimap import IdIndex, VIMap, consistency, to_hex
 
 _FIELDS = {
-    FileKind.MISSIONS: ("missions", "mission_ids", "baseframes", "baseframe_ids"),
-    FileKind.VERTICES: ("vertices", "vertex_ids"),
-    FileKind.EDGES: ("edges", "edge_ids"),
-    FileKind.LANDMARK_INDEX: ("landmark_index", "legacy_landmark_ids"),
+    map_files.FileKind.MISSIONS: ("missions", "mission_ids", "baseframes", "baseframe_ids"),
+    map_files.FileKind.VERTICES: ("vertices", "vertex_ids"),
+    map_files.FileKind.EDGES: ("edges", "edge_ids"),
+    map_files.FileKind.LANDMARK_INDEX: ("landmark_index", "legacy_landmark_ids"),
 }
 _PAIRS = (
     ("vertices", "vertex_ids"),
@@ -45,14 +39,14 @@ _NAMED = 3
 class FileFacts:
     """Facts about a file for the check of all files."""
 
-    kind: FileKind
+    kind: map_files.FileKind
     path: Path
     is_empty: bool
     has_roots: bool
     has_vertices: bool
 
 
-def check_file(kind: FileKind, path: Path, message: pb.VIMap) -> FileFacts:
+def check_file(kind: map_files.FileKind, path: Path, message: pb.VIMap) -> FileFacts:
     """Check that a file holds the kind that it is listed with, with one id per entity.
 
     Raises:
@@ -81,13 +75,13 @@ def check_empty_files(files: Sequence[FileFacts]) -> None:
     """
     kinds = [file.kind for file in files]
     needed = {
-        FileKind.MISSIONS: any(file.has_vertices for file in files),
-        FileKind.VERTICES: any(file.has_roots for file in files),
+        map_files.FileKind.MISSIONS: any(file.has_vertices for file in files),
+        map_files.FileKind.VERTICES: any(file.has_roots for file in files),
     }
     for file in files:
         if file.is_empty and (kinds.count(file.kind) > 1 or needed.get(file.kind, False)):
             raise MapError(
-                f"{file.path}: is empty: it holds no {_FIELDS[file.kind][0]}; {COPY_AGAIN}"
+                f"{file.path}: is empty: it holds no {_FIELDS[file.kind][0]}; {map_files.COPY_AGAIN}"
             )
 
 
@@ -175,13 +169,17 @@ def check_records(content: Content, max_bytes: int) -> None:
 
 def absent_parts(folder: Path, vi_map: VIMap) -> list[str]:
     """Return a note for each optional part that the folder lacks."""
-    notes = [f"{name} is not there" for name in (METADATA,) if not (folder / name).is_file()]
-    if len(vi_map.resources) and not (folder / RESOURCE_INFO).is_file():
-        notes.append(f"{RESOURCE_INFO} is not there: resources are looked up in the map's folder")
+    notes = [
+        f"{name} is not there" for name in (map_files.METADATA,) if not (folder / name).is_file()
+    ]
+    if len(vi_map.resources) and not (folder / map_files.RESOURCE_INFO).is_file():
+        notes.append(
+            f"{map_files.RESOURCE_INFO} is not there: resources are looked up in the map's folder"
+        )
     without = vi_map.sensors.without_extrinsics()
     if without:
         notes.append(
-            f"{SENSORS}: {counted(len(without), 'sensor')} without extrinsics, taken to be at the "
+            f"{map_files.SENSORS}: {counted(len(without), 'sensor')} without extrinsics, taken to be at the "
             f"base sensor: {_some(without)}"
         )
     return notes

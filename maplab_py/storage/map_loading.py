@@ -22,18 +22,12 @@ from maplab_py.storage.cache.map_cache import CachedMap
 from maplab_py.storage.mission_names import with_names
 from maplab_py.storage.protobuf import (
     frames_from_messages,
+    map_files,
     message_numbers,
     resources_from_messages,
     tables_from_messages,
 )
 from maplab_py.storage.protobuf.ids import ids_of
-from maplab_py.storage.protobuf.map_files import (
-    SENSORS,
-    VI_MAP_FOLDER,
-    FileKind,
-    listed_files,
-    read_unpacked,
-)
 from maplab_py.storage.protobuf.message_numbers import Name
 from maplab_py.storage.protobuf.scan import MemoryBudget
 from maplab_py.storage.protobuf.tables_from_messages import Content, required_rows, unique_index
@@ -131,7 +125,7 @@ def with_small_files(
     max_bytes = max_size_megabytes * 1_000_000
     checksums.verify(folder, listed)
     metadata, _ = resources_from_messages.read_metadata(folder, max_bytes)
-    sensors = read_sensors(folder / VI_MAP_FOLDER / SENSORS, max_bytes)
+    sensors = read_sensors(folder / map_files.VI_MAP_FOLDER / map_files.SENSORS, max_bytes)
     vi_map = with_names(cached.vi_map.replace(sensors=sensors, metadata=metadata), folder)
     facts = cached.facts
     report = _report(folder, vi_map, facts["files"], facts["megabytes"], facts["notes"], began)
@@ -158,7 +152,7 @@ def _load(
     folder: Path, budget: MemoryBudget, repair: bool, progress: Progress, listed: str
 ) -> tuple[VIMap, int, int, list[str]]:
     """Return the map, the number of its files and their unpacked bytes, and notes."""
-    files = listed_files(folder, budget.max_bytes)
+    files = map_files.listed_files(folder, budget.max_bytes)
     checksums.verify(folder, listed)
     with message_numbers.accept_bad_numbers() if repair else contextlib.nullcontext():
         return _loaded(folder, files, budget, repair, progress)
@@ -166,14 +160,14 @@ def _load(
 
 def _loaded(
     folder: Path,
-    files: Sequence[tuple[FileKind, Path]],
+    files: Sequence[tuple[map_files.FileKind, Path]],
     budget: MemoryBudget,
     repair: bool,
     progress: Progress,
 ) -> tuple[VIMap, int, int, list[str]]:
     parts = _read_files(files, budget, progress, in_processes=not repair)
     load_checks.check_empty_files(parts.facts)
-    sensors = read_sensors(folder / VI_MAP_FOLDER / SENSORS, budget.max_bytes)
+    sensors = read_sensors(folder / map_files.VI_MAP_FOLDER / map_files.SENSORS, budget.max_bytes)
     content = parts.content()
     load_checks.check_records(content, budget.max_bytes)
     vi_map, notes = _assemble(folder, content, parts.vertices, repair, budget)
@@ -188,7 +182,7 @@ def _loaded(
 
 
 def _read_files(
-    files: Sequence[tuple[FileKind, Path]],
+    files: Sequence[tuple[map_files.FileKind, Path]],
     budget: MemoryBudget,
     progress: Progress,
     *,
@@ -199,17 +193,21 @@ def _read_files(
     with reading_processes.parts_ahead(files if in_processes else []) as ahead:
         if ahead is not None:
             ahead.start(budget)
-            files = sorted(files, key=lambda file: file[0] is FileKind.VERTICES)  # others meanwhile
-        here = [path for kind, path in files if ahead is None or kind is not FileKind.VERTICES]
+            files = sorted(
+                files, key=lambda file: file[0] is map_files.FileKind.VERTICES
+            )  # others meanwhile
+        here = [
+            path for kind, path in files if ahead is None or kind is not map_files.FileKind.VERTICES
+        ]
         with read_ahead(here, budget.max_bytes) as contents:
             for index, (kind, path) in enumerate(files):
                 progress.step(index, len(files) + 1, "read files")
-                if ahead is None or kind is not FileKind.VERTICES:
+                if ahead is None or kind is not map_files.FileKind.VERTICES:
                     parts.read(kind, path, contents.take(), budget)
                     continue
                 part = ahead.take(path)
                 if part is None:
-                    parts.read(kind, path, read_unpacked(path, budget.max_bytes), budget)
+                    parts.read(kind, path, map_files.read_unpacked(path, budget.max_bytes), budget)
                     continue
                 budget.keep(path, sum(vertices.nbytes() for vertices in part.vertices))
                 parts.add(part)
@@ -431,7 +429,7 @@ class FilesAhead:
         if path is None:
             return Future()
         try:
-            return self._pool.submit(read_unpacked, path, self._max_bytes)
+            return self._pool.submit(map_files.read_unpacked, path, self._max_bytes)
         except RuntimeError as error:  # there is no space for the stack of the thread
             raise MemoryError(str(error)) from error
 

@@ -8,14 +8,9 @@ from maplab_py.array_types import I64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, yaw
 from maplab_py.report import Report
-from maplab_py.vimap.edits import merge_landmarks, transform_mission
+from maplab_py.vimap import edits, merge, queries, selection, sensor_merge, tables
 from maplab_py.vimap.ids import IdArray, IdIndex, is_valid, to_hex
-from maplab_py.vimap.merge import stack
-from maplab_py.vimap.queries import has_link
-from maplab_py.vimap.selection import keep_rows
-from maplab_py.vimap.sensor_merge import conflicting_sensors
 from maplab_py.vimap.table import ragged_rows
-from maplab_py.vimap.tables import NO_ROW, AbsolutePoses, ResourceOwner, Resources
 from maplab_py.vimap.vi_map import VIMap
 
 _ALIGNED_M = 1e-9
@@ -50,13 +45,13 @@ def append_submap(base: VIMap, submap: VIMap) -> tuple[VIMap, AppendReport]:
             vertices' frames differ, or the mission would fall into pieces.
     """
     mission_of = _matching_missions(base, submap)
-    if conflicts := conflicting_sensors(base.sensors, submap.sensors):
+    if conflicts := sensor_merge.conflicting_sensors(base.sensors, submap.sensors):
         raise MapError(
             f"the submap's sensor {conflicts[0]} has another calibration than the map's: "
             "a mission can have only one"
         )
     submap, shift_m, yaw_rad = _aligned(base, submap)
-    stacked = stack(base, submap)
+    stacked = merge.stack(base, submap)
     vertex = _row_in_base(base.vertices.id, submap.vertices.id, unite=True)
     missing = np.setdiff1d(
         submap.vertices.mission,
@@ -120,7 +115,7 @@ def _aligned(base: VIMap, submap: VIMap) -> tuple[VIMap, float, float]:
         T_M_N[:3] = T_M_I[4:] - yaw.rotate(T_M_N[3], T_N_I[4:])
         shift = float(np.linalg.norm(T_M_I[4:] - T_N_I[4:]))
         if max(shift, abs(T_M_N[3])) > _ALIGNED_M:
-            submap = transform_mission(submap, mission, yaw.to_pose(T_M_N))
+            submap = edits.transform_mission(submap, mission, yaw.to_pose(T_M_N))
             shift_m, yaw_rad = max(shift_m, shift), max(yaw_rad, abs(float(T_M_N[3])))
     return submap, shift_m, yaw_rad
 
@@ -143,13 +138,15 @@ def _unite_vertices(
     a, b = landmark[mine], landmark[theirs]
     both = (a >= 0) & (b >= 0)
     landmark[mine] = np.where(a >= 0, a, b)
-    landmark[theirs] = NO_ROW
+    landmark[theirs] = tables.NO_ROW
     stacked = stacked.replace(keypoints=stacked.keypoints.replace(landmark=landmark))
     redirected = _redirected(stacked, mission, vertex, frame_twin)
     kept = np.flatnonzero(vertex == np.arange(len(vertex)))
     table = redirected.vertices
     order = np.lexsort((table.timestamp_ns[kept], table.mission[kept]))
-    united = keep_rows(redirected, missions=np.arange(len(base.missions)), vertices=kept[order])
+    united = selection.keep_rows(
+        redirected, missions=np.arange(len(base.missions)), vertices=kept[order]
+    )
     return united, int(both.sum()), b[both].astype(np.int64), a[both].astype(np.int64)
 
 
@@ -192,7 +189,9 @@ def _redirected(stacked: VIMap, mission: I64, vertex: I64, frame_twin: I64) -> V
     redirected = imu.replace(from_vertex=vertex[imu.from_vertex], to_vertex=vertex[imu.to_vertex])
     return stacked.replace(
         vertices=table.replace(mission=mission[table.mission], nframe_id=nframe_id),
-        frames=frames.replace(vertex=np.where(frame_twin >= 0, NO_ROW, vertex[frames.vertex])),
+        frames=frames.replace(
+            vertex=np.where(frame_twin >= 0, tables.NO_ROW, vertex[frames.vertex])
+        ),
         landmarks=landmarks.replace(vertex=vertex[landmarks.vertex]),
         imu_edges=redirected.take(once),
         imu_samples=stacked.imu_samples.take(ragged_rows(stacked.sample_start, once)),
@@ -202,7 +201,7 @@ def _redirected(stacked: VIMap, mission: I64, vertex: I64, frame_twin: I64) -> V
     )
 
 
-def _absolute_poses_once(stacked: VIMap, vertex: I64) -> AbsolutePoses:
+def _absolute_poses_once(stacked: VIMap, vertex: I64) -> tables.AbsolutePoses:
     absolute = stacked.absolute_poses
     absolute = absolute.replace(vertex=vertex[absolute.vertex])
     keys = np.stack(
@@ -211,11 +210,11 @@ def _absolute_poses_once(stacked: VIMap, vertex: I64) -> AbsolutePoses:
     return absolute.take(_first_of_id(np.concatenate([keys, absolute.sensor_id], axis=1)))
 
 
-def _resources_once(stacked: VIMap, mission: I64, frame_twin: I64) -> Resources:
+def _resources_once(stacked: VIMap, mission: I64, frame_twin: I64) -> tables.Resources:
     resources = stacked.resources
     owner = resources.owner.astype(np.int64)
-    by_frame = resources.owner_kind == ResourceOwner.FRAME
-    by_mission = ~by_frame & (resources.owner_kind != ResourceOwner.NONE)
+    by_frame = resources.owner_kind == tables.ResourceOwner.FRAME
+    by_mission = ~by_frame & (resources.owner_kind != tables.ResourceOwner.NONE)
     frame = np.where(frame_twin >= 0, frame_twin, np.arange(len(frame_twin)))
     owner[by_frame] = frame[owner[by_frame]]
     owner[by_mission] = mission[owner[by_mission]]
@@ -245,11 +244,11 @@ def _unite_landmarks(
     swap = (quality[b] > quality[a]) | ((quality[b] == quality[a]) & (count[b] > count[a]))
     into, source = np.where(swap, b, a), np.where(swap, a, b)
     # equal ids: base's row always survives, so pairs are expressed in base's rows already
-    merged = merge_landmarks(stacked, equal_from, equal_into)
+    merged = edits.merge_landmarks(stacked, equal_from, equal_into)
     kept = np.setdiff1d(np.arange(len(stacked.landmarks)), equal_from)
     new_row = np.full(len(stacked.landmarks), -1, dtype=np.int64)
     new_row[kept] = np.arange(len(kept))
-    united = merge_landmarks(merged, new_row[source], new_row[into])
+    united = edits.merge_landmarks(merged, new_row[source], new_row[into])
     return united, len(merged.landmarks) - len(united.landmarks)
 
 
@@ -268,11 +267,11 @@ def _not_adjacent(base: VIMap, submap: VIMap, base_row: int, row: int) -> str:
 def _check_connected(base: VIMap, submap: VIMap, joined: VIMap) -> None:
     def gaps(vi_map: VIMap) -> int:
         mission = vi_map.vertices.mission
-        return int(np.count_nonzero(~has_link(vi_map)[:-1] & (mission[1:] == mission[:-1])))
+        return int(np.count_nonzero(~queries.has_link(vi_map)[:-1] & (mission[1:] == mission[:-1])))
 
     if gaps(joined) > gaps(base) + gaps(submap):
         mission = joined.vertices.mission
-        rows = np.flatnonzero(~has_link(joined)[:-1] & (mission[1:] == mission[:-1]))
+        rows = np.flatnonzero(~queries.has_link(joined)[:-1] & (mission[1:] == mission[:-1]))
         raise MapError(
             f"appending the submap would leave no edge between vertices "
             f"{to_hex(joined.vertices.id[rows[0]])} and {to_hex(joined.vertices.id[rows[0] + 1])}: "

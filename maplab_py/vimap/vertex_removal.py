@@ -8,10 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
-from maplab_py.vimap.ids import as_keys, to_hex
-from maplab_py.vimap.selection import as_mask, keep_rows
+from maplab_py.vimap import ids, selection, tables
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
-from maplab_py.vimap.tables import ImuEdges, TransformationEdges
 from maplab_py.vimap.vi_map import VIMap
 
 
@@ -72,13 +70,15 @@ def join_transformation_edges(vi_map: VIMap, vertex_kept: Mask) -> tuple[VIMap, 
         chains = _chains(vi_map, table, np.flatnonzero(group == index), vertex_kept)
         broken += chains.broken
         parts += [_composed(table, chains), table.take(chains.passed)]
-    joined = TransformationEdges.concatenate(parts)
-    joined = joined.take(np.lexsort((as_keys(joined.id).argsort().argsort(), joined.from_vertex)))
+    joined = tables.TransformationEdges.concatenate(parts)
+    joined = joined.take(
+        np.lexsort((ids.as_keys(joined.id).argsort().argsort(), joined.from_vertex))
+    )
     return vi_map.replace(transformation_edges=joined), broken
 
 
 def _chains(
-    vi_map: VIMap, table: ImuEdges | TransformationEdges, rows: I64, vertex_kept: Mask
+    vi_map: VIMap, table: tables.ImuEdges | tables.TransformationEdges, rows: I64, vertex_kept: Mask
 ) -> _Chains:
     """Find the edges `rows` of `table` that lie between kept neighbours of a mission."""
     count = len(vi_map.vertices)
@@ -106,7 +106,7 @@ def _chains(
     return _Chains(link[inner], start, last, passed, broken)
 
 
-def _composed(table: TransformationEdges, chains: _Chains) -> TransformationEdges:
+def _composed(table: tables.TransformationEdges, chains: _Chains) -> tables.TransformationEdges:
     """Compose the edges of each chain; all chains advance by one edge per round."""
     first = chains.edges[chains.start[:-1]]
     T, covariance = table.T_A_B[first].copy(), table.covariance[first].copy()
@@ -176,14 +176,14 @@ def remove_vertices_counted(vi_map: VIMap, vertices: ArrayLike) -> tuple[VIMap, 
     Raises:
         UserError: A mission would lose all its vertices.
     """
-    removed = as_mask(vertices, len(vi_map.vertices))
+    removed = selection.as_mask(vertices, len(vi_map.vertices))
     kept_per_mission = np.bincount(
         vi_map.vertices.mission[~removed], minlength=len(vi_map.missions)
     )
     emptied = np.flatnonzero((kept_per_mission == 0) & (np.diff(vi_map.vertex_start) > 0))
     if len(emptied):
         raise UserError(
-            f"cannot remove all vertices of mission {to_hex(vi_map.missions.id[emptied[0]])}: "
+            f"cannot remove all vertices of mission {ids.to_hex(vi_map.missions.id[emptied[0]])}: "
             "remove the mission"
         )
     homeless = np.flatnonzero(removed[vi_map.landmarks.vertex])
@@ -191,7 +191,7 @@ def remove_vertices_counted(vi_map: VIMap, vertices: ArrayLike) -> tuple[VIMap, 
     joined = move_landmarks(vi_map, homeless, store)
     joined, imu_dropped = join_imu_edges(joined, ~removed)
     joined, transformation_dropped = join_transformation_edges(joined, ~removed)
-    result = keep_rows(joined, vertices=np.flatnonzero(~removed))
+    result = selection.keep_rows(joined, vertices=np.flatnonzero(~removed))
     report = VertexRemoval(
         vertices=int(removed.sum()),
         observations=len(vi_map.observations) - len(result.observations),

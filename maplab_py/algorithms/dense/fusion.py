@@ -8,15 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from maplab_py.algorithms.dense.depth_inputs import (
-    DepthViews,
-    SceneDepth,
-    depth_type,
-    fuse_views,
-    grid_settings,
-    mission_groups,
-    short_id,
-)
+from maplab_py.algorithms.dense import depth_inputs, grid_kernels
 from maplab_py.algorithms.dense.grid import (
     GridContent,
     GridFormat,
@@ -24,7 +16,6 @@ from maplab_py.algorithms.dense.grid import (
     TsdfGrid,
     encode_arrays,
 )
-from maplab_py.algorithms.dense.grid_kernels import BLOCK_SIDE
 from maplab_py.algorithms.dense.options import FusionOptions
 from maplab_py.algorithms.dense.resources import chosen_missions
 from maplab_py.array_types import F64, I64, U64, Mask
@@ -100,26 +91,30 @@ def fuse_depth(
     """
     options = options or FusionOptions()
     rows = np.array(chosen_missions(vi_map, missions))
-    kind = depth_type(vi_map, rows, input_type)
+    kind = depth_inputs.depth_type(vi_map, rows, input_type)
     former = _grids(vi_map, rows)
     if former.any() and not overwrite:
         raise UserError(
             f"there is a grid of {counted(int(np.count_nonzero(former)), 'mission')} already: give "
             "--overwrite to replace it, or --update to follow changed poses"
         )
-    groups, notes = mission_groups(vi_map, rows)
-    depth = DepthViews(vi_map, map_folder, kind)
+    groups, notes = depth_inputs.mission_groups(vi_map, rows)
+    depth = depth_inputs.DepthViews(vi_map, map_folder, kind)
     new = NewResources(seed=b"grid")
     reports, owners = [], []
     for group in groups:
         resources = depth.of_missions(group)[:: options.integrate_every_nth]
         if not len(resources):
-            notes.append(f"mission {short_id(vi_map, group[0])}: no {resource_type(kind).name}")
+            notes.append(
+                f"mission {depth_inputs.short_id(vi_map, group[0])}: no {resource_type(kind).name}"
+            )
             continue
         T_M_G = se3.inverse(vi_map.T_G_M[group[0]])
         poses = depth.poses(resources, T_M_G)
-        scene = SceneDepth.of(depth, resources, options)
-        grid = fuse_views(depth, resources, poses, grid_settings(options, scene), progress)
+        scene = depth_inputs.SceneDepth.of(depth, resources, options)
+        grid = depth_inputs.fuse_views(
+            depth, resources, poses, depth_inputs.grid_settings(options, scene), progress
+        )
         fused = FusedDepth(vi_map.resources.id[resources], poses)
         new.add(GRID_TYPE, encode_grid(StoredGrid(grid, fused)))
         owners.append(group[0])
@@ -168,7 +163,7 @@ def update_grids(
             "the missions have no grid: create_tsdf_from_depth_resource makes one",
             remedy="create_tsdf_from_depth_resource",
         )
-    groups, notes = mission_groups(vi_map, np.arange(len(vi_map.missions)))
+    groups, notes = depth_inputs.mission_groups(vi_map, np.arange(len(vi_map.missions)))
     store = ResourceStore(vi_map, map_folder)
     new = NewResources(seed=b"grid")
     reports, owners, kinds, replaced = (
@@ -184,7 +179,9 @@ def update_grids(
         stored = decode_grid(store.load(row), name)
         _check_settings(stored.grid.settings, options or FusionOptions(), name)
         resources = _rows_of(vi_map, stored.fused)
-        depth = DepthViews(vi_map, map_folder, int(vi_map.resources.type[resources[0]]))
+        depth = depth_inputs.DepthViews(
+            vi_map, map_folder, int(vi_map.resources.type[resources[0]])
+        )
         if input_type not in (None, depth.kind):
             raise UserError(
                 f"{name} is of {resource_type(depth.kind).name}, and --update keeps that: leave out "
@@ -231,7 +228,7 @@ def _check_settings(settings: GridSettings, options: FusionOptions, source: str)
 
 def _follow(
     stored: StoredGrid,
-    depth: DepthViews,
+    depth: depth_inputs.DepthViews,
     resources: I64,
     moved: Mask,
     T_M_C: F64,
@@ -332,7 +329,7 @@ def _report(
 
 
 _FORMAT = GridFormat("tsdf 1", "grid", "create_tsdf_from_depth_resource")
-_SHAPE = (BLOCK_SIDE,) * 3
+_SHAPE = (grid_kernels.BLOCK_SIDE,) * 3
 _WHOLE_NUMBERS = ("depth_power",)
 
 

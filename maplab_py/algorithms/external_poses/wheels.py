@@ -4,12 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from maplab_py.algorithms.external_poses import trajectories
 from maplab_py.algorithms.external_poses.options import WheelOptions
-from maplab_py.algorithms.external_poses.trajectories import (
-    content_words,
-    with_sensor,
-    without_edges,
-)
 from maplab_py.array_types import F64, I64, U64
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
@@ -51,7 +47,7 @@ def attach_wheels(
             is not set; distances or turns are far from those of the map; the map has no such sensor.
     """
     given = _given_sensor(vi_map, options.sensor_id)
-    vi_map = without_edges(
+    vi_map = trajectories.without_edges(
         vi_map,
         mission,
         TransformationKind.WHEEL_ODOMETRY,
@@ -71,17 +67,20 @@ def attach_wheels(
     if not len(first):
         raise _no_overlap(track, times_ns, stamps)
     if given is None:
-        words, covariance = content_words(vi_map, mission, "wheels", times_ns, T_O_S), None
+        words, covariance = (
+            trajectories.content_words(vi_map, mission, "wheels", times_ns, T_O_S),
+            None,
+        )
         keys = {"topic": "", "description": "wheel odometry of another program"}
         kind = MissionSensor.WHEEL_ODOMETRY
-        vi_map = with_sensor(vi_map, mission, kind, words, options.T_I_S, keys)
+        vi_map = trajectories.with_sensor(vi_map, mission, kind, words, options.T_I_S, keys)
     else:
         vi_map, words, covariance = _with_given_sensor(vi_map, mission, given)
     T_A_B = se3.relative(T_O_S[first], T_O_S[first + 1])
     ratio = _compared(vi_map, mission, to_hex(words), rows[first], T_A_B, track.source)
     if covariance is None:
         covariance = _covariances(T_A_B, options, is_planar=track.is_planar)
-    seed = content_words(vi_map, mission, "wheel edges", times_ns, T_O_S)
+    seed = trajectories.content_words(vi_map, mission, "wheel edges", times_ns, T_O_S)
     count, rng = len(first), np.random.default_rng(seed)
     edges = tables.TransformationEdges.filled(
         count,

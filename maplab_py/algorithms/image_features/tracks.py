@@ -14,9 +14,7 @@ from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap, mission_mask, tables, type_name
-from maplab_py.vision.descriptors import DescriptorKind
-from maplab_py.vision.epipolar_matching import EpipolarRule, ImageRays, match_images
-from maplab_py.vision.track_union import unite_tracks
+from maplab_py.vision import descriptors, epipolar_matching, track_union
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -86,12 +84,12 @@ def track_features(
 def _match_neighbours(
     vi_map: VIMap,
     options: FeatureTrackOptions,
-    kind: DescriptorKind,
+    kind: descriptors.DescriptorKind,
     free: Mask,
     progress: Progress,
 ) -> _Links:
     """Match the free keypoints (K,) of each frame with those of the frames that follow it."""
-    rule = EpipolarRule(
+    rule = epipolar_matching.EpipolarRule(
         options.epipolar_gate_px,
         options.min_depth_m,
         kind.largest(options.max_bit_fraction, options.max_descriptor_distance),
@@ -99,7 +97,7 @@ def _match_neighbours(
     )
     pairs = _neighbours(vi_map, free, options.neighbors)
     first, second, difference = [], [], []
-    images: dict[int, tuple[ImageRays, I64]] = {}
+    images: dict[int, tuple[epipolar_matching.ImageRays, I64]] = {}
     for number, (a, b) in enumerate(pairs.tolist()):
         progress.step(number, len(pairs), "frames")
         for frame in (a, b):
@@ -107,7 +105,7 @@ def _match_neighbours(
                 images[frame] = _rays(vi_map, frame, kind, free)
         images = {row: value for row, value in images.items() if row >= a}
         (rays_a, rows_a), (rays_b, rows_b) = images[a], images[b]
-        i, j, gap = match_images(rays_a, rays_b, rule)
+        i, j, gap = epipolar_matching.match_images(rays_a, rays_b, rule)
         first.append(rows_a[i])
         second.append(rows_b[j])
         difference.append(gap.astype(np.int64))
@@ -137,7 +135,9 @@ def _neighbours(vi_map: VIMap, free: Mask, most: int) -> I64:
     return every[np.lexsort((every[:, 1], every[:, 0]))]
 
 
-def _rays(vi_map: VIMap, frame: int, kind: DescriptorKind, free: Mask) -> tuple[ImageRays, I64]:
+def _rays(
+    vi_map: VIMap, frame: int, kind: descriptors.DescriptorKind, free: Mask
+) -> tuple[epipolar_matching.ImageRays, I64]:
     """Return the free keypoints of a frame, and their rows."""
     rows, _ = keypoints_of(vi_map, np.array([frame]))
     rows = rows[free[rows]]
@@ -147,7 +147,7 @@ def _rays(vi_map: VIMap, frame: int, kind: DescriptorKind, free: Mask) -> tuple[
     origin_G: F64 = se3.transform(T_G_I, origin_I[0] if len(origin_I) else np.zeros(3))
     raw = np.ascontiguousarray(vi_map.keypoints.descriptor[rows, : kind.size])
     ray_G = np.ascontiguousarray(so3.rotate(T_G_I[:4], ray_I))
-    return ImageRays(kind.comparable(raw), ray_G, rad_per_px, origin_G), rows
+    return epipolar_matching.ImageRays(kind.comparable(raw), ray_G, rad_per_px, origin_G), rows
 
 
 def _tracks(vi_map: VIMap, links: _Links) -> tuple[I64, Mask]:
@@ -162,7 +162,7 @@ def _tracks(vi_map: VIMap, links: _Links) -> tuple[I64, Mask]:
     first, second = links.first[order], links.second[order]
     rows, index = np.unique(np.concatenate([first, second]), return_inverse=True)
     a, b = index[: len(first)], index[len(first) :]
-    accepted = unite_tracks(
+    accepted = track_union.unite_tracks(
         a,
         b,
         np.arange(len(rows) + 1),

@@ -12,9 +12,7 @@ from maplab_py.algorithms.localization.localizer import Localization, Localizer,
 from maplab_py.algorithms.loop_closure.features import MapFeatures, map_features
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import UserError
-from maplab_py.geometry import se3, so3
-from maplab_py.geometry.alignment import align_yaw_position, umeyama
-from maplab_py.geometry.interpolation import interpolate_poses
+from maplab_py.geometry import alignment, interpolation, se3, so3
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap, descriptors, starts_of_counts, to_hex_list
 from maplab_py.vision.projection import DescriptorProjection
@@ -97,9 +95,9 @@ def align_robustly(p_R: F64, p_G: F64, *, level: bool) -> F64:
     T_R_G = se3.identity()
     for _ in range(_ROUNDS):
         if level:
-            T_R_G = align_yaw_position(p_R[kept], p_G[kept])
+            T_R_G = alignment.align_yaw_position(p_R[kept], p_G[kept])
         else:
-            T_R_G, _ = umeyama(p_R[kept], p_G[kept])
+            T_R_G, _ = alignment.umeyama(p_R[kept], p_G[kept])
         error = np.linalg.norm(p_R - se3.transform(T_R_G, p_G), axis=1)
         now = error <= max(_TRUSTED * float(np.median(error)), 1e-6)
         if np.array_equal(now, kept) or now.sum() < 3:
@@ -284,16 +282,18 @@ def ground_truth(
     Raises:
         UserError: No query lies in the truth's time span.
     """
-    poses, known = interpolate_poses(
+    poses, known = interpolation.interpolate_poses(
         times_ns, T_R_I, query.vertices.timestamp_ns[localizations.vertex]
     )
     if not known.any():
         raise UserError(f"{name}: none of the queries lies in its time span")
     reference = Reference(name, poses, known)
     if searched is not None:
-        where, inside = interpolate_poses(times_ns, T_R_I, searched.vertices.timestamp_ns)
+        where, inside = interpolation.interpolate_poses(
+            times_ns, T_R_I, searched.vertices.timestamp_ns
+        )
         if inside.sum() >= _MIN_PAIRS:
-            T_R_G, _ = umeyama(where[inside, 4:], searched.T_G_I[inside, 4:])
+            T_R_G, _ = alignment.umeyama(where[inside, 4:], searched.T_G_I[inside, 4:])
             return reference, T_R_G
     return reference, _from_answers(reference, localizations, level=False)
 

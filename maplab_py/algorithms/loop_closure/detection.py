@@ -8,22 +8,19 @@ from pathlib import Path
 
 import numpy as np
 
-from maplab_py.algorithms.loop_closure.alignment_contest import AlignmentChoice, Contest
+from maplab_py.algorithms.loop_closure import alignment_contest, closure_table, gates, matching
 from maplab_py.algorithms.loop_closure.candidates import (
     CandidateRule,
     Candidates,
     Matches,
     find_candidates,
 )
-from maplab_py.algorithms.loop_closure.closure_table import Closures, closure_ids
 from maplab_py.algorithms.loop_closure.features import (
     MapFeatures,
     SearchScope,
     map_features,
     points_in_mission,
 )
-from maplab_py.algorithms.loop_closure.gates import judge, measure
-from maplab_py.algorithms.loop_closure.matching import match_features
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.array_types import I64, NDArray
 from maplab_py.distinct import distinct
@@ -43,13 +40,13 @@ _EVERYTHING = SearchScope()
 class Detection:
     """Detected closures and statistics of the search."""
 
-    closures: Closures
+    closures: closure_table.Closures
     query_vertices: int
     database_landmarks: int
     descriptor_matches: int
     best_votes: int  # most matches of a query vertex with a place if there is no candidate
     notes: tuple[str, ...] = ()
-    contests: tuple[Contest, ...] = ()  # of missions of unknown relative pose
+    contests: tuple[alignment_contest.Contest, ...] = ()  # of missions of unknown relative pose
 
 
 def detect(
@@ -59,7 +56,7 @@ def detect(
     missions: I64,
     only_other_missions: bool = False,
     trust_base_frames: bool = True,
-    choice: AlignmentChoice | None = None,
+    choice: alignment_contest.AlignmentChoice | None = None,
     scope: SearchScope = _EVERYTHING,
     progress: Progress = SILENT,
 ) -> Detection:
@@ -92,7 +89,7 @@ def detect(
     rule = MatchRule(round(options.min_image_time_seconds * 1e9))
     progress.step(1, 4, "descriptor matches")
     asked = None if scope.queries is None else np.flatnonzero(scope.queries[features.vertex])
-    matches, database_landmarks = match_features(
+    matches, database_landmarks = matching.match_features(
         features, options, rule, only_other_missions, asked
     )
     progress.step(2, 4, "places")
@@ -176,17 +173,17 @@ def _closures(
     search: PoseSearch,
     options: LoopClosureOptions,
     trust_base_frames: bool,
-    choice: AlignmentChoice | None,
-) -> tuple[Closures, tuple[Contest, ...]]:
+    choice: alignment_contest.AlignmentChoice | None,
+) -> tuple[closure_table.Closures, tuple[alignment_contest.Contest, ...]]:
     """Build the table of closures with the verdicts of the gates."""
     s, query = search.solutions, candidates.query_vertex
     place = _most_seen(vi_map, search, candidates.place_vertex)
     is_known = vi_map.baseframes.is_known[vi_map.missions.baseframe] & trust_base_frames
-    measured = measure(vi_map, query, place, s, is_known)
-    judged, contests = judge(vi_map, query, place, s.T_M_I, measured, options, choice=choice)
-    closures = Closures(
+    measured = gates.measure(vi_map, query, place, s, is_known)
+    judged, contests = gates.judge(vi_map, query, place, s.T_M_I, measured, options, choice=choice)
+    closures = closure_table.Closures(
         **vars(judged),
-        id=closure_ids(vi_map, query, place),
+        id=closure_table.closure_ids(vi_map, query, place),
         query_vertex=query,
         place_vertex=place,
         T_M_I=s.T_M_I,
@@ -335,7 +332,7 @@ def _problems(
     mission = vi_map.vertices.mission[place].astype(np.int64)
     problems = PoseProblems(
         start=starts_of_counts(np.bincount(problem, minlength=len(mission))),
-        key=closure_ids(vi_map, query, place)[:, 0].view(np.int64),
+        key=closure_table.closure_ids(vi_map, query, place)[:, 0].view(np.int64),
         q_M_I=vi_map.vertices.T_M_I[query, :4],
         origin_I=features.origin_I[feature],
         ray_I=features.ray_I[feature],

@@ -12,27 +12,10 @@ import numpy as np
 
 from maplab_py.algorithms.gate import YES_NO, Gate
 from maplab_py.algorithms.landmarks.keypoint_rays import largest_sigma
-from maplab_py.algorithms.loop_closure.alignment_contest import (
-    AlignmentChoice,
-    Contest,
-    ContestRule,
-    decide,
-    is_significant,
-    with_choice,
-)
+from maplab_py.algorithms.loop_closure import alignment_contest, mission_alignment
 from maplab_py.algorithms.loop_closure.closure_record import ClosureRecord
 from maplab_py.algorithms.loop_closure.closure_table import VERDICTS, GateValues
 from maplab_py.algorithms.loop_closure.consensus import ConsensusRule, check_consensus, path_lengths
-from maplab_py.algorithms.loop_closure.mission_alignment import (
-    AgreementRule,
-    Alignment,
-    MissionPair,
-    PairedClosures,
-    alignments_of_pairs,
-    is_refuted,
-    trajectory_stretches,
-    unmatched_share,
-)
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.record_updates import banned
 from maplab_py.algorithms.loop_closure.reports import Verdict
@@ -215,7 +198,7 @@ class Judgement:
     @functools.cached_property
     def stretch(self) -> I64:
         """Stretch (V,) of each vertex."""
-        return trajectory_stretches(self.vi_map)
+        return mission_alignment.trajectory_stretches(self.vi_map)
 
     @functools.cached_property
     def is_usual(self) -> Mask:
@@ -231,9 +214,9 @@ class Judgement:
         return np.asarray(self.values.correction_m > drift_m)
 
     @functools.cached_property
-    def paired(self) -> PairedClosures:
+    def paired(self) -> mission_alignment.PairedClosures:
         """The closures as relative poses of their missions."""
-        return PairedClosures.of(
+        return mission_alignment.PairedClosures.of(
             self.missions,
             (self.vi_map.vertices.T_M_I[self.query], self.T_M_I),
             self.way_m,
@@ -250,8 +233,8 @@ def judge(
     measured: GateValues,
     options: LoopClosureOptions,
     *,
-    choice: AlignmentChoice | None = None,
-) -> tuple[GateValues, list[Contest]]:
+    choice: alignment_contest.AlignmentChoice | None = None,
+) -> tuple[GateValues, list[alignment_contest.Contest]]:
     """Apply all gates: geometry, plausible drift, ambiguity, consensus of neighbours.
 
     Args:
@@ -293,22 +276,26 @@ def judge(
     return v, contests
 
 
-def _contests(j: Judgement, geometric: Mask, choice: AlignmentChoice | None) -> list[Contest]:
+def _contests(
+    j: Judgement, geometric: Mask, choice: alignment_contest.AlignmentChoice | None
+) -> list[alignment_contest.Contest]:
     """Weigh the alignments of missions for which closures between unrelated missions vote.
 
     Closures with far places of the query's mission show which places look alike. `geometric` (N,) are
     those that passed the gates on their poses.
     """
-    v, rule = j.values, ContestRule(j.options.max_ambiguous_ratio)
+    v, rule = j.values, alignment_contest.ContestRule(j.options.max_ambiguous_ratio)
     voting = v.accepted & ~v.is_related
     v.follows[voting] = 0.0
     is_alias = geometric & j.is_far & (v.inliers >= _MIN_RIVAL_INLIERS)
-    pairs = alignments_of_pairs(j.paired, voting | is_alias, AgreementRule())
+    pairs = mission_alignment.alignments_of_pairs(
+        j.paired, voting | is_alias, mission_alignment.AgreementRule()
+    )
     names = [to_hex(words)[:8] for words in j.vi_map.missions.id]
-    contests = decide(j.vi_map, pairs, j.stretch, rule, names)
+    contests = alignment_contest.decide(j.vi_map, pairs, j.stretch, rule, names)
     is_open = [contest.winner < 0 for contest in contests]
     if choice is not None:
-        contests = with_choice(contests, choice)
+        contests = alignment_contest.with_choice(contests, choice)
     for contest, was_open in zip(contests, is_open, strict=True):
         rows = contest.pair.rows
         v.is_decided[rows] = contest.winner >= 0
@@ -381,16 +368,22 @@ def _repeats(j: Judgement) -> Mask:
     candidate = j.values.accepted & (j.missions[0] == j.missions[1])
     unusual = candidate & ~j.is_usual
     if unusual.any():
-        rule = ContestRule(j.options.max_ambiguous_ratio)
-        for pair in alignments_of_pairs(j.paired, candidate, AgreementRule()):
+        rule = alignment_contest.ContestRule(j.options.max_ambiguous_ratio)
+        for pair in mission_alignment.alignments_of_pairs(
+            j.paired, candidate, mission_alignment.AgreementRule()
+        ):
             for rival in _rivals(j.vi_map, pair, j.is_usual, j.stretch, rule):
                 refused[rival.rows] = True
     return np.asarray(refused & unusual)
 
 
 def _rivals(
-    vi_map: VIMap, pair: MissionPair, is_usual: Mask, stretch: I64, rule: ContestRule
-) -> list[Alignment]:
+    vi_map: VIMap,
+    pair: mission_alignment.MissionPair,
+    is_usual: Mask,
+    stretch: I64,
+    rule: alignment_contest.ContestRule,
+) -> list[mission_alignment.Alignment]:
     """Return the groups of closures that lose against those of usual drift."""
     usual = [a for a in pair.alignments if np.mean(is_usual[a.rows]) > 0.5]
     explained = np.unique(
@@ -398,22 +391,26 @@ def _rivals(
     )
     if len(explained) < _MIN_STRETCHES:
         return []
-    unmatched = min(unmatched_share(vi_map, pair, a, stretch) for a in usual)
+    unmatched = min(mission_alignment.unmatched_share(vi_map, pair, a, stretch) for a in usual)
     others = [a for a in pair.alignments if np.mean(is_usual[a.rows]) <= 0.5]
     return [
         a
         for a in others
         if _adds_little(_stretches(a), explained, rule)
-        or is_refuted(unmatched_share(vi_map, pair, a, stretch), unmatched)
+        or mission_alignment.is_refuted(
+            mission_alignment.unmatched_share(vi_map, pair, a, stretch), unmatched
+        )
     ]
 
 
-def _adds_little(group: I64, explained: I64, rule: ContestRule) -> bool:
+def _adds_little(group: I64, explained: I64, rule: alignment_contest.ContestRule) -> bool:
     """Return whether most stretches of a group, and significantly more others, are explained without it."""
     theirs = len(np.setdiff1d(group, explained))
     ours = len(np.setdiff1d(explained, group))
-    return is_significant(ours, theirs, rule) and theirs <= _MAX_NEW_SHARE * len(group)
+    return alignment_contest.is_significant(ours, theirs, rule) and theirs <= _MAX_NEW_SHARE * len(
+        group
+    )
 
 
-def _stretches(alignment: Alignment) -> I64:
+def _stretches(alignment: mission_alignment.Alignment) -> I64:
     return np.union1d(alignment.stretches_A, alignment.stretches_B)

@@ -9,10 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from maplab_py.algorithms.gate import failures
-from maplab_py.algorithms.loop_closure import closure_record
+from maplab_py.algorithms.loop_closure import closure_record, gates, options
 from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
-from maplab_py.algorithms.loop_closure.gates import closure_gates
-from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.reports import ClosureLine, ClosureReport, Verdict
 from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.errors import UserError
@@ -104,7 +102,7 @@ def _verdicts_with(reason: str) -> list[int]:
 
 def near_miss_order(closures: closure_record.ClosureRecord) -> F64:
     """Return failed gates (N,) plus the shortfall, which is below 1, as the order of near misses."""
-    failed, total = failures(closure_gates(closures, LoopClosureOptions()))
+    failed, total = failures(gates.closure_gates(closures, options.LoopClosureOptions()))
     return np.asarray(failed + total / (1.0 + total), dtype=np.float64)
 
 

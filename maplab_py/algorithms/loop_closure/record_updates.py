@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 
+from maplab_py.algorithms.loop_closure import closure_table
 from maplab_py.algorithms.loop_closure.closure_record import (
     USES,
     ClosureRecord,
@@ -13,12 +14,6 @@ from maplab_py.algorithms.loop_closure.closure_record import (
     MergePairs,
     read_record,
     write_record,
-)
-from maplab_py.algorithms.loop_closure.closure_table import (
-    VERDICTS,
-    Closures,
-    GateValues,
-    make_edges,
 )
 from maplab_py.algorithms.loop_closure.consensus import path_lengths
 from maplab_py.algorithms.loop_closure.merging import MergeResult
@@ -31,7 +26,7 @@ from maplab_py.geometry import se3
 from maplab_py.vimap import IdArray, IdIndex, LoopClosureEdges, VIMap, to_hex_list
 from maplab_py.vimap.edits import add_landmarks, remove_loop_closure_edges, with_p_G
 
-REMOVED = VERDICTS.index(Verdict.REMOVED)
+REMOVED = closure_table.VERDICTS.index(Verdict.REMOVED)
 _BAN_REACH_M = 2.0
 """A removed closure bans closures of its query with places within this arc length."""
 
@@ -57,7 +52,7 @@ def banned(vi_map: VIMap, query_vertex: I64, place_vertex: I64) -> Mask:
 
 def with_closures(
     vi_map: VIMap,
-    closures: Closures,
+    closures: closure_table.Closures,
     use: str,
     *,
     used: Mask | None = None,
@@ -95,7 +90,7 @@ def with_closures(
 
 
 def _closure_rows(
-    vi_map: VIMap, c: Closures, use: str, used: Mask | None, weight: F64 | None
+    vi_map: VIMap, c: closure_table.Closures, use: str, used: Mask | None, weight: F64 | None
 ) -> ClosureRecord:
     served = c.accepted if used is None else used
     with np.errstate(invalid="ignore"):
@@ -108,14 +103,17 @@ def _closure_rows(
         place=vi_map.vertices.id[c.place_vertex],
         T_A_B=c.T_A_B,
         sigma=sigma,
-        **{field.name: getattr(c, field.name) for field in dataclasses.fields(GateValues)},
+        **{
+            field.name: getattr(c, field.name)
+            for field in dataclasses.fields(closure_table.GateValues)
+        },
         use=np.where(served, USES.index(use), 0),
         weight=np.ones(len(c)) if weight is None else weight,
     ).take(np.sort(first))
 
 
 def _with_merges(
-    record: LoopRecord, before: VIMap, closures: Closures, merges: MergeResult
+    record: LoopRecord, before: VIMap, closures: closure_table.Closures, merges: MergeResult
 ) -> LoopRecord:
     """Append the pairs, the landmarks before merging, and the keypoints that observed them."""
     lm = before.landmarks
@@ -197,7 +195,9 @@ def accept_closures(vi_map: VIMap, ids: IdArray, options: LoopClosureOptions) ->
     """
     record = read_record(vi_map)
     c = record.closures
-    chosen = (IdIndex(ids).rows(c.id) >= 0) & (c.verdict != VERDICTS.index(Verdict.ACCEPTED))
+    chosen = (IdIndex(ids).rows(c.id) >= 0) & (
+        c.verdict != closure_table.VERDICTS.index(Verdict.ACCEPTED)
+    )
     new = c.take(chosen)
     unknown = ~np.isfinite(new.sigma).all(axis=1)
     if unknown.any():
@@ -206,11 +206,11 @@ def accept_closures(vi_map: VIMap, ids: IdArray, options: LoopClosureOptions) ->
     query, place = (vi_map.vertex_index.rows(v).astype(np.int64) for v in (new.query, new.place))
     T_M_A = se3.compose(vi_map.vertices.T_M_I[place], se3.inverse(new.T_A_B))
     covariance = new.sigma.astype(np.float64)[:, :, None] ** 2 * np.eye(6)
-    edges = make_edges(new.id, (query, place), T_M_A, new.T_A_B, covariance, options)
+    edges = closure_table.make_edges(new.id, (query, place), T_M_A, new.T_A_B, covariance, options)
     old = vi_map.loop_closure_edges
     kept = old.take(IdIndex(new.id).rows(old.id) < 0)
     closures = c.replace(
-        verdict=np.where(chosen, VERDICTS.index(Verdict.ACCEPTED), c.verdict),
+        verdict=np.where(chosen, closure_table.VERDICTS.index(Verdict.ACCEPTED), c.verdict),
         use=np.where(chosen, USES.index("edge"), c.use),
         weight=np.where(chosen, 1.0, c.weight),
     )

@@ -5,32 +5,17 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from maplab_py.algorithms.recording_check.correction import correct
-from maplab_py.algorithms.recording_check.doctor import Diagnosis, diagnose_signals
-from maplab_py.algorithms.recording_check.findings import Verdict
-from maplab_py.algorithms.recording_check.inertial_checks import (
-    accel_unit,
-    measured_quiet,
-    raw_axes_agree,
-)
+from maplab_py.algorithms.recording_check import correction, doctor, findings, inertial_checks
 from maplab_py.array_types import F64
 from maplab_py.interop.device import RecordedSensors
-from maplab_py.interop.recordings.options import StreamOptions
-from maplab_py.interop.recordings.protocol import (
-    CameraImage,
-    ImuBatch,
-    Item,
-    PartSpan,
-    Recording,
-    TrackedFrameSet,
-)
+from maplab_py.interop.recordings import options, protocol
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class RecalibratedRecording:
     """A recording with another calibration."""
 
-    plain: Recording
+    plain: protocol.Recording
     device: RecordedSensors
     note: str = ""  # where the calibration is from
 
@@ -59,11 +44,13 @@ class RecalibratedRecording:
         """Notes of the reader, and where the calibration is from."""
         return (*self.plain.notes, self.note)
 
-    def parts(self) -> tuple[PartSpan, ...]:
+    def parts(self) -> tuple[protocol.PartSpan, ...]:
         """Return the parts between restarts of the clock."""
         return self.plain.parts()
 
-    def items(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Item]:
+    def items(
+        self, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[protocol.Item]:
         """Yield the items of the recording."""
         yield from self.plain.items(start_ns, end_ns)
 
@@ -90,7 +77,9 @@ class MendedRecording(RecalibratedRecording):
         accel, gyro = accel_gyro[:, :3] @ self.accel.T, accel_gyro[:, 3:] @ self.gyro.T
         return np.concatenate([accel, gyro], axis=1)
 
-    def items(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Item]:
+    def items(
+        self, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[protocol.Item]:
         """Yield the items of the recording, mended; see `Recording`."""
         old = [camera.time_offset_ns for camera in self.plain.device.cameras]
         shift_ns = [
@@ -99,28 +88,31 @@ class MendedRecording(RecalibratedRecording):
         ]
         imu = self.device.imu
         for item in self.plain.items(start_ns, end_ns):
-            if isinstance(item, ImuBatch) and imu is not None:
-                yield ImuBatch.of(imu, item.times_ns, self.mend(item.accel_gyro))
-            elif isinstance(item, CameraImage):
+            if isinstance(item, protocol.ImuBatch) and imu is not None:
+                yield protocol.ImuBatch.of(imu, item.times_ns, self.mend(item.accel_gyro))
+            elif isinstance(item, protocol.CameraImage):
                 yield dataclasses.replace(item, time_ns=item.time_ns + shift_ns[item.camera])
-            elif isinstance(item, TrackedFrameSet):
+            elif isinstance(item, protocol.TrackedFrameSet):
                 yield dataclasses.replace(item, time_ns=item.time_ns + shift_ns[0])
             else:
                 yield item
 
 
 def mended(
-    recording: Recording, diagnosis: Diagnosis, stream: StreamOptions
+    recording: protocol.Recording, diagnosis: doctor.Diagnosis, stream: options.StreamOptions
 ) -> MendedRecording | None:
     """Return a recording with what its diagnosis finds wrong, and can put right; None if nothing."""
-    if any(f.verdict is Verdict.HOPELESS for f in diagnosis.findings) or not diagnosis.cameras:
+    if (
+        any(f.verdict is findings.Verdict.HOPELESS for f in diagnosis.findings)
+        or not diagnosis.cameras
+    ):
         return None
     read = _with_samples(recording, diagnosis)
     if read.words:
         imu = diagnosis.signals.imu
         imu = dataclasses.replace(imu, accel_gyro=read.mend(imu.accel_gyro))
-        diagnosis = diagnose_signals(dataclasses.replace(diagnosis.signals, imu=imu), stream)
-    corrected = correct(diagnosis)
+        diagnosis = doctor.diagnose_signals(dataclasses.replace(diagnosis.signals, imu=imu), stream)
+    corrected = correction.correct(diagnosis)
     if corrected.device is diagnosis.signals.device:
         words = read.words
     else:
@@ -129,13 +121,13 @@ def mended(
     return dataclasses.replace(read, device=corrected.device, words=words) if words else None
 
 
-def _with_samples(recording: Recording, diagnosis: Diagnosis) -> MendedRecording:
+def _with_samples(recording: protocol.Recording, diagnosis: doctor.Diagnosis) -> MendedRecording:
     """Return a recording whose samples are in the units and axes of the calibration."""
     signals, first = diagnosis.signals, diagnosis.cameras[0]
     accel, gyro, words = np.eye(3), np.eye(3), []
-    quiet = measured_quiet(signals)
-    unit = accel_unit(quiet) if quiet is not None else 1.0
-    wrong = {f.check: f for f in diagnosis.findings if f.verdict is Verdict.WRONG}
+    quiet = inertial_checks.measured_quiet(signals)
+    unit = inertial_checks.accel_unit(quiet) if quiet is not None else 1.0
+    wrong = {f.check: f for f in diagnosis.findings if f.verdict is findings.Verdict.WRONG}
     if "unit of the accelerometer" in wrong and unit != 1.0:
         accel = unit * accel
         words.append(f"accelerations times {unit:.6g}")
@@ -144,7 +136,7 @@ def _with_samples(recording: Recording, diagnosis: Diagnosis) -> MendedRecording
         words.append(f"rates times {first.unit:.6g}")
     if axes := wrong.get("axes of the gyroscope"):
         gyro = first.axes @ gyro
-        if raw_axes_agree(signals, unit * signals.imu.accel_gyro[:, :3], first):
+        if inertial_checks.raw_axes_agree(signals, unit * signals.imu.accel_gyro[:, :3], first):
             accel = first.axes @ accel
         words.append(f"axes {axes.observed}")
     if "sign of the accelerometer" in wrong:

@@ -8,11 +8,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from maplab_py.algorithms.recording_check.image_samples import (
-    CameraSampler,
-    ImageFigures,
-    PointPairs,
-)
+from maplab_py.algorithms.recording_check import image_samples
 from maplab_py.algorithms.recording_check.stereo import StereoSampler
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import MapError
@@ -53,8 +49,8 @@ class CameraSignal:
     """Images of one camera: all times, and what its sampled images show."""
 
     times_ns: I64  # (N,) in the clock of the IMU
-    figures: tuple[ImageFigures, ...]
-    pairs: PointPairs
+    figures: tuple[image_samples.ImageFigures, ...]
+    pairs: image_samples.PointPairs
     unmatched: int  # without partners in the other cameras
     damaged: int  # of the sampled images
 
@@ -120,7 +116,9 @@ class _Reader:
         cameras = device.cameras
         self._batches: list[protocol.ImuBatch] = []
         self._times_ns = [array("q") for _ in cameras]
-        self._samplers = [CameraSampler(camera, row) for row, camera in enumerate(cameras)]
+        self._samplers = [
+            image_samples.CameraSampler(camera, row) for row, camera in enumerate(cameras)
+        ]
         self._stereo = [StereoSampler(cameras[0], camera) for camera in cameras[1:]]
         self._sets = Synchroniser(len(cameras), tolerance_ns)
         self._next_stereo_ns = 0
@@ -154,7 +152,7 @@ class _Reader:
             CameraSignal(
                 np.asarray(times, dtype=np.int64),
                 tuple(sampler.figures),
-                PointPairs.stack(sampler.pairs),
+                image_samples.PointPairs.stack(sampler.pairs),
                 unmatched,
                 damaged,
             )

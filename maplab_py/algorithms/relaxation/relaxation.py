@@ -22,10 +22,8 @@ import time
 
 import numpy as np
 
+from maplab_py.algorithms.loop_closure import record_updates, reports, workflow
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.algorithms.loop_closure.record_updates import with_closures
-from maplab_py.algorithms.loop_closure.reports import LoopClosureReport
-from maplab_py.algorithms.loop_closure.workflow import search_loops
 from maplab_py.algorithms.relaxation import map_edges
 from maplab_py.algorithms.relaxation.options import RelaxationOptions, RelaxationReport, SwitchedOff
 from maplab_py.algorithms.relaxation.robust import Solution, optimize_robustly
@@ -243,7 +241,7 @@ def relax_over_loops(
     *,
     missions: I64 | None = None,
     progress: Progress = SILENT,
-) -> tuple[VIMap, LoopClosureReport, RelaxationReport]:
+) -> tuple[VIMap, reports.LoopClosureReport, RelaxationReport]:
     """Relax a map over the closures that are found in it and the edges that it has.
 
     The closures go into the map's record with the weight that was left to each; they do not become
@@ -257,8 +255,10 @@ def relax_over_loops(
         relaxed = relax_graph(vi_map, options, missions=missions, progress=progress)
         name = descriptors.type_name(wanted)
         note = f"the map has no {name} descriptors: only its own loop closure edges count"
-        return relaxed.vi_map, LoopClosureReport(notes=(note,)), relaxed.report
-    search, search_report = search_loops(vi_map, loop_options, missions=missions, progress=progress)
+        return relaxed.vi_map, reports.LoopClosureReport(notes=(note,)), relaxed.report
+    search, search_report = workflow.search_loops(
+        vi_map, loop_options, missions=missions, progress=progress
+    )
     new = IdIndex(vi_map.loop_closure_edges.id).rows(search.edges.id) < 0
     relaxed = relax_graph(
         vi_map,
@@ -268,7 +268,7 @@ def relax_over_loops(
         progress=progress,
     )
     used = IdIndex(relaxed.closures.id).rows(search.closures.id)
-    result = with_closures(
+    result = record_updates.with_closures(
         relaxed.vi_map,
         search.closures,
         "relax",

@@ -8,9 +8,7 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.self_calibration.estimation.imu_interpolation import (
-    correct_interpolation_bias,
-)
+from maplab_py.algorithms.self_calibration.estimation import imu_interpolation
 from maplab_py.algorithms.self_calibration.estimation.parameters import Parameters
 from maplab_py.algorithms.self_calibration.estimation.problem import (
     SegmentProblem,
@@ -103,7 +101,9 @@ def calibrate(
         MapError: Calibrations are missing.
     """
     began = time.perf_counter()
-    corrected = correct_interpolation_bias(vi_map) if options.imu_curvature else vi_map
+    corrected = (
+        imu_interpolation.correct_interpolation_bias(vi_map) if options.imu_curvature else vi_map
+    )
     initial = build_segment_problem(corrected, options, missions=missions, progress=progress)
     built = time.perf_counter()
     solution = solve_twice(initial, options, missions, progress)

@@ -13,14 +13,11 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_py.algorithms.self_calibration import reports
 from maplab_py.algorithms.self_calibration.calibration import Calibration, calibrate
 from maplab_py.algorithms.self_calibration.device import device_of
 from maplab_py.algorithms.self_calibration.estimation.problem import SegmentProblem, runs_of
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
-from maplab_py.algorithms.self_calibration.reports import (
-    ParameterEstimate,
-    SelfCalibrationReport,
-)
 from maplab_py.algorithms.self_calibration.segments.database import SegmentDatabase
 from maplab_py.algorithms.self_calibration.segments.selection import collect
 from maplab_py.algorithms.self_calibration.segments.splitting import extract_submap
@@ -64,7 +61,7 @@ def calibrate_with_checks(
     batch: bool = False,
     selector: Selector | None = None,
     progress: Progress = SILENT,
-) -> tuple[SensorSet, SegmentDatabase | None, SelfCalibrationReport]:
+) -> tuple[SensorSet, SegmentDatabase | None, reports.SelfCalibrationReport]:
     """Calibrate; where a camera moves too far, keep its position and calibrate the rest again.
 
     Args:
@@ -93,7 +90,7 @@ def calibrate_with_checks(
 
     def estimate(
         options: SelfCalibrationOptions,
-    ) -> tuple[SensorSet, Calibration, SelfCalibrationReport]:
+    ) -> tuple[SensorSet, Calibration, reports.SelfCalibrationReport]:
         if batch:
             result, report = calibrate(vi_map, options, missions=missions, progress=progress)
             return result.sensors, result, report
@@ -122,12 +119,12 @@ def calibrate_with_checks(
 
 
 def _with_spread(
-    report: SelfCalibrationReport,
+    report: reports.SelfCalibrationReport,
     result: Calibration,
     options: SelfCalibrationOptions,
     parts: int,
     progress: Progress,
-) -> SelfCalibrationReport:
+) -> reports.SelfCalibrationReport:
     """Return the report with deviations that are at least the spread of results on parts.
 
     The vertices are split into runs of equal length. Each is calibrated alone, from the result. The
@@ -159,13 +156,15 @@ def _span_s(problem: SegmentProblem) -> float:
     return 1e-9 * float(np.diff(time_ns)[run[1:] == run[:-1]].sum())
 
 
-def doubt_large_changes(report: SelfCalibrationReport, span_s: float) -> SelfCalibrationReport:
+def doubt_large_changes(
+    report: reports.SelfCalibrationReport, span_s: float
+) -> reports.SelfCalibrationReport:
     """Return the report in which short data confirm no large change of a parameter."""
     if span_s >= _MIN_SPAN_S:
         return report
     determined = (Verdict.WELL_DETERMINED.text(), Verdict.WEAKLY_DETERMINED.text())
 
-    def doubt(estimate: ParameterEstimate) -> ParameterEstimate:
+    def doubt(estimate: reports.ParameterEstimate) -> reports.ParameterEstimate:
         change = abs(estimate.change_in_sigmas)
         if change <= _MAX_CHANGE_IN_SIGMAS or estimate.verdict not in determined:
             return estimate
@@ -175,8 +174,8 @@ def doubt_large_changes(report: SelfCalibrationReport, span_s: float) -> SelfCal
 
 
 def _with_kept_positions(
-    report: SelfCalibrationReport, rejected: SelfCalibrationReport, shift_m: float
-) -> SelfCalibrationReport:
+    report: reports.SelfCalibrationReport, rejected: reports.SelfCalibrationReport, shift_m: float
+) -> reports.SelfCalibrationReport:
     """Return a report with the camera positions of the rejected calibration, as they were before."""
     verdict = Verdict.KEPT.text(1e3 * shift_m)
     estimated = {estimate.parameter for estimate in report.parameters}

@@ -7,15 +7,14 @@ import numpy as np
 from maplab_py.algorithms.self_calibration.reports import CalibrationComparison, ComparedParameter
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
-from maplab_py.sensors import Camera, SensorSet
-from maplab_py.sensors.calibration_transfer import Device, camera_models
-from maplab_py.sensors.camera import parameter_names
-from maplab_py.sensors.imu import TRIANGLE_NAMES, ImuIntrinsics
-from maplab_py.sensors.projection import back_project, project
+from maplab_py.sensors import Camera, SensorSet, calibration_transfer, camera, imu, projection
 
 
 def compare(
-    first: SensorSet, first_device: Device, second: SensorSet, second_device: Device
+    first: SensorSet,
+    first_device: calibration_transfer.Device,
+    second: SensorSet,
+    second_device: calibration_transfer.Device,
 ) -> CalibrationComparison:
     """Compare the calibrations of two devices.
 
@@ -24,7 +23,7 @@ def compare(
     """
     pairs = ((first, first_device), (second, second_device))
     rigs = [sensors.camera_rig(device.rig) for sensors, device in pairs]
-    if camera_models(rigs[0]) != camera_models(rigs[1]):
+    if calibration_transfer.camera_models(rigs[0]) != calibration_transfer.camera_models(rigs[1]):
         raise UserError("the calibrations are of different cameras: their number or models differ")
     prefixes = ["camera "]
     if len(rigs[0].cameras) > 1:
@@ -42,7 +41,7 @@ def compare(
             rows.append(
                 _row(f"{prefix}rotation about {name}", "deg", 0.0, float(turn_deg[k, axis]))
             )
-    imus = [sensors.imu(device.imu).intrinsics or ImuIntrinsics() for sensors, device in pairs]
+    imus = [sensors.imu(device.imu).intrinsics or imu.ImuIntrinsics() for sensors, device in pairs]
     return CalibrationComparison(
         (*rows, *_imu_rows(*imus)),
         max((pixel_shift(a, b) for _, a, b in cameras), default=0.0),
@@ -55,8 +54,8 @@ def pixel_shift(a: Camera, b: Camera) -> float:
     """Return the largest distance [px] between the images of a ray in two cameras, over a grid."""
     u, v = np.meshgrid(np.linspace(0, a.width_px, 17), np.linspace(0, a.height_px, 13))
     uv = np.stack([u.reshape(-1), v.reshape(-1)], axis=1)
-    ray, is_known = back_project(a, uv)
-    projected, is_visible = project(b, ray)
+    ray, is_known = projection.back_project(a, uv)
+    projected, is_visible = projection.project(b, ray)
     both = is_known & is_visible
     return float(np.linalg.norm(projected[both] - uv[both], axis=1).max(initial=0.0))
 
@@ -66,7 +65,7 @@ def _camera_rows(prefix: str, a: Camera, b: Camera) -> list[ComparedParameter]:
     rows = [
         _row(prefix + name, unit, x, y)
         for (name, unit), x, y in zip(
-            parameter_names(a.projection, a.distortion), *values, strict=True
+            camera.parameter_names(a.projection, a.distortion), *values, strict=True
         )
     ]
     rows.append(_row(f"{prefix}image delay", "s", a.image_delay_s, b.image_delay_s))
@@ -76,11 +75,11 @@ def _camera_rows(prefix: str, a: Camera, b: Camera) -> list[ComparedParameter]:
     return rows
 
 
-def _imu_rows(a: ImuIntrinsics, b: ImuIntrinsics) -> list[ComparedParameter]:
+def _imu_rows(a: imu.ImuIntrinsics, b: imu.ImuIntrinsics) -> list[ComparedParameter]:
     rows = [
         _row(f"{sensor} {name}", "", float(x[place]), float(y[place]))
         for sensor, x, y in (("gyroscope", a.T_g, b.T_g), ("accelerometer", a.T_a, b.T_a))
-        for name, place in TRIANGLE_NAMES.items()
+        for name, place in imu.TRIANGLE_NAMES.items()
     ]
     turns_deg = np.rad2deg(so3.log(so3.from_matrix(np.stack([a.R_A_I, b.R_A_I])))).tolist()
     for axis, x, y in zip("xyz", *turns_deg, strict=True):

@@ -9,9 +9,7 @@ import numpy as np
 
 from maplab_py.algorithms.self_calibration.calibration import calibrate
 from maplab_py.algorithms.self_calibration.device import transfer_calibration
-from maplab_py.algorithms.self_calibration.estimation.imu_interpolation import (
-    correct_interpolation_bias,
-)
+from maplab_py.algorithms.self_calibration.estimation import imu_interpolation
 from maplab_py.algorithms.self_calibration.estimation.parameters import Parameters
 from maplab_py.algorithms.self_calibration.estimation.problem import build_segment_problem
 from maplab_py.algorithms.self_calibration.estimation.solution import (
@@ -204,7 +202,7 @@ def estimate_segment(segment: VIMap, options: SelfCalibrationOptions) -> Segment
         EstimationError: It has no information.
     """
     if options.imu_curvature:
-        segment = correct_interpolation_bias(segment)
+        segment = imu_interpolation.correct_interpolation_bias(segment)
     problem = build_segment_problem(segment, options)
     states = solve_rejecting_outliers(problem, options).states
     parameters = problem.parameters

@@ -19,13 +19,6 @@ from maplab_py.algorithms.sparsification.options import (
     SparsificationOptions,
     SparsificationReport,
 )
-from maplab_py.algorithms.sparsification.selection import (
-    CoverageProblem,
-    Solution,
-    choose_greedily,
-    level_values,
-    solve_relaxed,
-)
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.distinct import distinct
 from maplab_py.errors import UserError
@@ -119,7 +112,7 @@ def sparsify(
 
 def coverage_problem(
     vi_map: VIMap, landmarks: I64, keep: int, options: SparsificationOptions
-) -> tuple[CoverageProblem, I64]:
+) -> tuple[selection.CoverageProblem, I64]:
     """Return the coverage problem of some landmarks and the vertex rows (K,) of the keyframes."""
     row = np.full(len(vi_map.landmarks) + 1, -1, dtype=np.int64)
     row[landmarks] = np.arange(len(landmarks))
@@ -135,14 +128,14 @@ def coverage_problem(
         weight = landmark_weights(vi_map, landmarks, threshold_bits=threshold)
     available = np.bincount(keyframe, weight[landmark], minlength=len(vertices))
     wanted = float(options.min_keypoints_per_keyframe)
-    problem = CoverageProblem(
+    problem = selection.CoverageProblem(
         keyframe=keyframe,
         landmark=landmark,
         score=landmark_scores(vi_map, landmarks, threshold_bits=threshold),
         weight=weight,
         wanted=np.minimum(available, wanted),
         base=np.zeros(len(vertices)),
-        level_value=level_values(options.slack_levels),
+        level_value=selection.level_values(options.slack_levels),
         full=wanted,
         keep=keep,
     )
@@ -150,8 +143,8 @@ def coverage_problem(
 
 
 def with_weights_of_evidence(
-    problem: CoverageProblem, vi_map: VIMap, landmarks: I64, options: PersistenceOptions
-) -> CoverageProblem:
+    problem: selection.CoverageProblem, vi_map: VIMap, landmarks: I64, options: PersistenceOptions
+) -> selection.CoverageProblem:
     """Return a problem that weights landmarks (L,) by the probability that a session matches them.
 
     It is the probability that the landmark exists, times that of a match if it does.
@@ -167,7 +160,7 @@ def with_weights_of_evidence(
 
 
 def _coverage(
-    problem: CoverageProblem, vertex: I64, chosen: Mask, options: SparsificationOptions
+    problem: selection.CoverageProblem, vertex: I64, chosen: Mask, options: SparsificationOptions
 ) -> Coverage:
     """Count the landmarks that each keyframe observes, without weights."""
     size = problem.keyframes
@@ -178,7 +171,7 @@ def _coverage(
 
 
 def choose(
-    problem: CoverageProblem, options: SparsificationOptions, progress: Progress = SILENT
+    problem: selection.CoverageProblem, options: SparsificationOptions, progress: Progress = SILENT
 ) -> tuple[selection.Solution, int]:
     """Select landmarks with the given method; also return the number of parts."""
     if options.method == "ilp":
@@ -232,8 +225,8 @@ def _worst(vi_map: VIMap, coverage: Coverage) -> tuple[KeyframeCoverage, ...]:
 
 
 def solve_by_parts(
-    problem: CoverageProblem, landmarks_per_part: int, *, progress: Progress = SILENT
-) -> tuple[Solution, int]:
+    problem: selection.CoverageProblem, landmarks_per_part: int, *, progress: Progress = SILENT
+) -> tuple[selection.Solution, int]:
     """Select greedily over the whole map, then optimise each part while the others are fixed.
 
     The greedy selection determines the number of landmarks of each part and the cover of border
@@ -242,20 +235,20 @@ def solve_by_parts(
     Returns:
         The solution, whose bound is not known (NaN), and the number of parts.
     """
-    chosen = choose_greedily(problem)
+    chosen = selection.choose_greedily(problem)
     parts = split(problem, landmarks_per_part)
     for number, rows in enumerate(parts):
         progress.step(number, len(parts), "parts of the map")
         inner = problem.restricted(rows, chosen)
         if inner.keep in (0, inner.landmarks):
             continue
-        better = solve_relaxed(inner)
+        better = selection.solve_relaxed(inner)
         if better.objective > inner.objective(chosen[rows]):
             chosen[rows] = better.chosen
-    return Solution(chosen, problem.objective(chosen), float("nan")), len(parts)
+    return selection.Solution(chosen, problem.objective(chosen), float("nan")), len(parts)
 
 
-def split(problem: CoverageProblem, landmarks_per_part: int) -> list[I64]:
+def split(problem: selection.CoverageProblem, landmarks_per_part: int) -> list[I64]:
     """Return landmark rows of parts of nearly equal size, along the co-visibility graph.
 
     Keyframes are ordered such that co-visible ones are close (reverse Cuthill and McKee 1969, which

@@ -7,10 +7,8 @@ import numpy as np
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
 from maplab_py.estimation.states import States
+from maplab_py.estimation.terms import inertial_calibration, pose, wheel
 from maplab_py.estimation.terms.cameras import EXTRINSICS, INTRINSICS, TIMING, Cameras
-from maplab_py.estimation.terms.inertial_calibration import GYRO, intrinsics_of
-from maplab_py.estimation.terms.pose import MOUNTING
-from maplab_py.estimation.terms.wheel import WHEEL_SCALE
 from maplab_py.geometry import se3
 from maplab_py.sensors import Camera, CameraRig, Distortion, Imu, Projection, SensorSet
 from maplab_py.sensors.camera import DISTORTION_SIZE, INTRINSICS_SIZE
@@ -105,11 +103,13 @@ def with_cameras(sensors: SensorSet, rig: RigCameras, states: States) -> SensorS
 
 def with_imus(sensors: SensorSet, imus: tuple[Imu, ...], states: States) -> SensorSet:
     """Return the sensors with scale, misalignment and R_A_I of IMUs taken from the states."""
-    if GYRO not in states.blocks:
+    if inertial_calibration.GYRO not in states.blocks:
         return sensors
     changed = {
         imu.id: dataclasses.replace(imu, intrinsics=intrinsics)
-        for imu, intrinsics in zip(imus, intrinsics_of(states.blocks), strict=True)
+        for imu, intrinsics in zip(
+            imus, inertial_calibration.intrinsics_of(states.blocks), strict=True
+        )
     }
     return dataclasses.replace(sensors, sensors={**sensors.sensors, **changed})
 
@@ -117,7 +117,7 @@ def with_imus(sensors: SensorSet, imus: tuple[Imu, ...], states: States) -> Sens
 def with_wheels(sensors: SensorSet, wheels: tuple[str, ...], states: States) -> SensorSet:
     """Return the sensors with the scales of wheel sensors (ids) taken from the states."""
     for sensor_id, (scale,) in zip(
-        wheels, states.blocks[WHEEL_SCALE].values if wheels else (), strict=True
+        wheels, states.blocks[wheel.WHEEL_SCALE].values if wheels else (), strict=True
     ):
         sensors = with_wheel_scale(sensors, sensor_id, scale)
     return sensors
@@ -131,11 +131,11 @@ class MountedSensors:
 
     def written(self, sensors: SensorSet, states: States) -> SensorSet:
         """Return the sensors with these extrinsics taken from the states."""
-        if MOUNTING not in states.blocks:
+        if pose.MOUNTING not in states.blocks:
             return sensors
         extrinsics = dict(sensors.extrinsics)
         for (imu_id, sensor_id), T_I_S in zip(
-            self.owner, states.blocks[MOUNTING].values, strict=True
+            self.owner, states.blocks[pose.MOUNTING].values, strict=True
         ):
             old = extrinsics.get(sensor_id)
             if old is None:

@@ -17,11 +17,9 @@ from maplab_py.estimation.codegen.kernels import residual_kernel
 from maplab_py.estimation.imu.inertial_data import InertialData
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.states import ACCEL_BIAS, GYRO_BIAS, States
-from maplab_py.estimation.terms import inertial_calibration, pose
+from maplab_py.estimation.terms import inertial_calibration, pose, protocol, wheel
 from maplab_py.estimation.terms.inertial import BiasWalkTerm, InertialTerm
 from maplab_py.estimation.terms.prior import BlockPrior, PosePrior, VertexVectorPrior
-from maplab_py.estimation.terms.protocol import FactorTerm
-from maplab_py.estimation.terms.wheel import WHEEL_SCALE, ScaledRelativePoseTerm, wheel_scale_block
 from maplab_py.geometry import se3, so3, symmetric
 from maplab_py.progress import Progress
 from maplab_py.sensors import Imu
@@ -88,7 +86,7 @@ def _deviations(difference_m: F64, covariance: F64) -> F64:
 class MapFactors:
     """Factor terms of a map, the states with their parameter blocks, and the sensors of the blocks."""
 
-    terms: list[FactorTerm]
+    terms: list[protocol.FactorTerm]
     states: States
     imus: tuple[Imu, ...] = ()  # rows of the IMU blocks
     mounted: MountedSensors = dataclasses.field(default_factory=MountedSensors)
@@ -136,9 +134,9 @@ def factor_terms(
     return result
 
 
-def prior_terms(states: States, options: PriorOptions) -> list[FactorTerm]:
+def prior_terms(states: States, options: PriorOptions) -> list[protocol.FactorTerm]:
     """Return the enabled priors of poses and biases at the given states."""
-    vertices, terms = np.arange(len(states.T_G_I)), list[FactorTerm]()
+    vertices, terms = np.arange(len(states.T_G_I)), list[protocol.FactorTerm]()
     sigmas = [options.position_prior_sigma_m] * 3 + [options.orientation_prior_sigma_rad] * 3
     if any(sigmas):
         root = np.diag([1.0 / sigma if sigma > 0.0 else 0.0 for sigma in sigmas])
@@ -245,7 +243,7 @@ def _with_wheel_scales(so_far: MapFactors, vi_map: VIMap, selection: Selection) 
     if not wheels:
         return so_far
     scales = np.array([wheel_scale(vi_map.sensors, sensor_id) for sensor_id in wheels])
-    states = so_far.states.with_blocks(wheel_scale_block(scales))
+    states = so_far.states.with_blocks(wheel.wheel_scale_block(scales))
     return dataclasses.replace(so_far, states=states, wheels=wheels)
 
 
@@ -264,7 +262,7 @@ def _odometry(
     name: str,
     is_fixed: bool,
     progress: Progress,
-) -> list[FactorTerm]:
+) -> list[protocol.FactorTerm]:
     from maplab_py.estimation.symbolic import sources
 
     table = vi_map.transformation_edges
@@ -289,7 +287,9 @@ def _odometry(
         return [term]
     wheels = np.stack([from_hex(sensor_id) for sensor_id in so_far.wheels])
     sensor = np.argmax((table.sensor_id[edges][:, None] == wheels).all(axis=2), axis=1)
-    return [ScaledRelativePoseTerm(term, sensor, so_far.states.nodes(WHEEL_SCALE)[sensor])]
+    return [
+        wheel.ScaledRelativePoseTerm(term, sensor, so_far.states.nodes(wheel.WHEEL_SCALE)[sensor])
+    ]
 
 
 def _unscaled(vi_map: VIMap, sensor_id: U64, measured: F64, W: F64) -> tuple[F64, F64]:

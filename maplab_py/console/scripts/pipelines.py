@@ -13,14 +13,10 @@ from maplab_py.console.commands.flags import CONSOLE_FLAGS, Flag, parse_words
 from maplab_py.console.scripts.batch import Batch
 from maplab_py.console.session.session import Session
 from maplab_py.console.session.status import Status
-from maplab_py.console.terminal.foreground import cancelling_interrupts
-from maplab_py.console.terminal.output import ConsoleTerminal
-from maplab_py.console.terminal.render import wants_colour
+from maplab_py.console.terminal import foreground, output, render
 from maplab_py.errors import Cancelled, FlagError
-from maplab_py.pipeline.driver import run_pipeline
+from maplab_py.pipeline import driver, plan, progress
 from maplab_py.pipeline.options import PipelineOptions
-from maplab_py.pipeline.plan import Pipeline, in_place
-from maplab_py.pipeline.progress import Watcher
 
 if TYPE_CHECKING:
     from rich.live import Live
@@ -65,7 +61,7 @@ def run_as_pipeline(
     path: Path,
     options: PipelineOptions,
     session: Session,
-    terminal: ConsoleTerminal,
+    terminal: output.ConsoleTerminal,
     *,
     keep_going: bool,
     discard: bool,
@@ -91,9 +87,9 @@ def run_as_pipeline(
     origin = str(path)
     is_staged = bool(batch.stages)
     pipeline = (
-        Pipeline(origin, maps, batch.stages)
+        plan.Pipeline(origin, maps, batch.stages)
         if is_staged
-        else in_place(origin, maps, batch.commands)
+        else plan.in_place(origin, maps, batch.commands)
     )
     left_out = {*CONSOLE_FLAGS, *([_MAPS_FOLDER] if is_staged else [])}
     settings = session.settings.current()
@@ -101,15 +97,15 @@ def run_as_pipeline(
     results = options.results_folder or Path(f"{path.stem}_results")
     start = time.monotonic()
     try:
-        with StageTable(terminal) as table, cancelling_interrupts():
-            report = run_pipeline(
+        with StageTable(terminal) as table, foreground.cancelling_interrupts():
+            report = driver.run_pipeline(
                 pipeline,
                 results,
                 options,
                 flags=flags,
                 keep_going=keep_going,
                 discard=discard,
-                watcher=Watcher(table.line, table.show),
+                watcher=progress.Watcher(table.line, table.show),
             )
     except (Cancelled, KeyboardInterrupt):
         text = "batch: cancelled; finished tasks are kept (--resume runs the others)"
@@ -138,7 +134,7 @@ class StageCounts(Protocol):
 class StageTable:
     """Shows how many tasks of each stage wait, run and have ended."""
 
-    def __init__(self, terminal: ConsoleTerminal) -> None:
+    def __init__(self, terminal: output.ConsoleTerminal) -> None:
         """Prepare the table.
 
         Args:
@@ -149,7 +145,7 @@ class StageTable:
 
     def __enter__(self) -> Self:
         """Start to follow, if standard error is a terminal."""
-        if wants_colour(sys.stderr):
+        if render.wants_colour(sys.stderr):
             from rich.console import Console
             from rich.live import Live
 

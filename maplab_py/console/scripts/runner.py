@@ -16,21 +16,13 @@ from maplab_py.atomic import write_file
 from maplab_py.cancellation import CancelToken
 from maplab_py.console.commands.flag_types import expand_path
 from maplab_py.console.commands.lines import TypedCommand, typed_commands, variable_lookup
-from maplab_py.console.scripts.aliases import expanded
-from maplab_py.console.scripts.checking import LEAVE, check_script
-from maplab_py.console.scripts.costs import Plan, measuring, predict
+from maplab_py.console.scripts import aliases, checking, costs
 from maplab_py.console.scripts.rescue import Rescue
 from maplab_py.console.session.call import Call
 from maplab_py.console.session.jobs import Job
 from maplab_py.console.session.session import Refusal, Session
 from maplab_py.console.session.status import Status, describe, status_of
-from maplab_py.console.terminal.foreground import (
-    interruptible,
-    run_in_foreground,
-    terminal_lent,
-    terminations_as_interrupts,
-)
-from maplab_py.console.terminal.output import ConsoleTerminal
+from maplab_py.console.terminal import foreground, output
 from maplab_py.errors import MaplabError, UserError
 from maplab_py.report import Report
 
@@ -50,7 +42,7 @@ class Runner:
         wants_exit: The user has asked to leave.
     """
 
-    def __init__(self, session: Session, terminal: ConsoleTerminal) -> None:
+    def __init__(self, session: Session, terminal: output.ConsoleTerminal) -> None:
         """Make a runner.
 
         Args:
@@ -62,7 +54,7 @@ class Runner:
         self.wants_exit = False
         self._alias_depth = 0
         self._rescue: Rescue | None = None  # of a script
-        self._plan: Plan | None = None
+        self._plan: costs.Plan | None = None
         terminal.mission_names = lambda: session.mission_names
         terminal.page_of_ids = lambda: session.marks.get("viewer", "")
 
@@ -102,9 +94,9 @@ class Runner:
 
         A text with an error is not started, unless the commands after a failure shall run anyway.
         """
-        problems, steps = ([], []) if keep_going else check_script(text, self.session)
+        problems, steps = ([], []) if keep_going else checking.check_script(text, self.session)
         if not problems and self.terminal.shows_progress:
-            self._plan = predict(steps, self.session.maps)
+            self._plan = costs.predict(steps, self.session.maps)
         return self.report_problems(problems) or self.run_checked(text, keep_going=keep_going)
 
     def run_checked(self, text: str, *, keep_going: bool = False) -> Status:
@@ -114,7 +106,7 @@ class Runner:
         """
         self._rescue = Rescue(self.session)
         try:
-            with terminations_as_interrupts():
+            with foreground.terminations_as_interrupts():
                 return self.run_text(text, keep_going=keep_going)
         except KeyboardInterrupt:
             return Status.CANCELLED  # between two commands
@@ -219,7 +211,7 @@ class Runner:
                 return Status.OK
             if not command.words:
                 return self._run_shell(command.shell)
-            text = expanded(command, self.session.aliases)
+            text = aliases.expanded(command, self.session.aliases)
         except UserError as error:
             return self.report_error("", error)
         if text is None:
@@ -235,7 +227,7 @@ class Runner:
     def _run(self, command: TypedCommand) -> Status:
         """Run one command and show its report."""
         words = command.words
-        if words[0] in LEAVE and len(words) == 1:
+        if words[0] in checking.LEAVE and len(words) == 1:
             self.wants_exit = True
             return Status.OK
         logger.info("command: %s", command.source)
@@ -254,9 +246,9 @@ class Runner:
                 self._pipe(command.shell),
                 self._write(command),
                 self.session.lock,
-                measuring(call, self.session),
+                costs.measuring(call, self.session),
             ):
-                report = run_in_foreground(
+                report = foreground.run_in_foreground(
                     call.command.name,
                     lambda: self.session.execute(call),
                     token=token,
@@ -291,7 +283,7 @@ class Runner:
     def _show(self, report: Report, name: str, seconds: float, *, in_shell: bool) -> bool:
         """Show a report; return whether it was shown to its end and not cut by Ctrl-C."""
         try:
-            with nullcontext() if in_shell else interruptible():
+            with nullcontext() if in_shell else foreground.interruptible():
                 self.terminal.show(report, name, seconds)
         except KeyboardInterrupt:
             return False
@@ -319,7 +311,7 @@ class Runner:
             return self.report_error("", UserError("no command after '!' (write !ls)"))
         self.terminal.echo_to_transcript("> !" + line)
         try:
-            with terminal_lent():
+            with foreground.terminal_lent():
                 child = subprocess.run(line, shell=True, check=False, env=self._environment)
         except KeyboardInterrupt:
             return Status.CANCELLED
@@ -360,7 +352,7 @@ class Runner:
             yield
             return
         with (
-            terminal_lent(),
+            foreground.terminal_lent(),
             subprocess.Popen(
                 line, shell=True, stdin=subprocess.PIPE, text=True, env=self._environment
             ) as child,

@@ -7,17 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from maplab_py.console.commands import flag_types, flags, suggest
 from maplab_py.console.commands.command import Command
-from maplab_py.console.commands.flag_types import expand_path
-from maplab_py.console.commands.flags import (
-    Given,
-    explanation,
-    normalise,
-    parse_words,
-    read_flagfile,
-)
 from maplab_py.console.commands.registry import Registry
-from maplab_py.console.commands.suggest import did_you_mean
 from maplab_py.console.session.settings import Settings
 from maplab_py.errors import FlagError, UserError
 
@@ -56,7 +48,7 @@ def call_from_words(words: Sequence[str], registry: Registry, settings: Settings
     if command.raw_arguments:
         wants_help = list(words[1:]) == ["--help"]
         return Call(command, {}, () if wants_help else tuple(words[1:]), {}, wants_help)
-    given, plain = parse_words(_with_output(words[1:], command), command.flags, command.name)
+    given, plain = flags.parse_words(_with_output(words[1:], command), command.flags, command.name)
     common = {g.name: g.text for g in given if g.name not in command.flags}
     texts: dict[str, str] = {}
     for path in (g.text for g in given if g.name == "flagfile"):
@@ -98,12 +90,12 @@ def call_from_keywords(
         if keyword in command.defaults:
             values.update(_group_values(command, keyword, value))
     for keyword, value in keywords.items():
-        name = normalise(keyword).rstrip("_")
+        name = flags.normalise(keyword).rstrip("_")
         if keyword in command.defaults or name in ("dry_run", "max_memory_gb"):
             continue
         if name not in command.flags:
             known = [*command.flags, *command.defaults]
-            proposal = explanation(name) or did_you_mean(name, known, "--")
+            proposal = flags.explanation(name) or suggest.did_you_mean(name, known, "--")
             raise FlagError(f"{command.name} has no flag --{name}{proposal}")
         values[name] = command.flags[name].convert(value)
     placed, rest = _place(list(words), command, {})
@@ -181,14 +173,14 @@ def _place(
 def _flagfile_texts(text: str, command: Command, registry: Registry) -> dict[str, str]:
     """Return the flags of a flag file for this command; flags of other commands are skipped."""
     try:
-        path = expand_path(text)
+        path = flag_types.expand_path(text)
     except ValueError as error:
         raise FlagError(f"--flagfile={text}: {error}") from None
     known = {**registry.all_flags(), **command.flags}
     texts: dict[str, str] = {}
-    for line in read_flagfile(path or Path()):
+    for line in flags.read_flagfile(path or Path()):
         try:
-            given, plain = parse_words(line.words, known, command.name)
+            given, plain = flags.parse_words(line.words, known, command.name)
             if plain:
                 raise FlagError(f"'{plain[0]}' is not a flag (write --name=value)")
             texts.update(_check(given, command))
@@ -197,7 +189,7 @@ def _flagfile_texts(text: str, command: Command, registry: Registry) -> dict[str
     return texts
 
 
-def _check(given: Sequence[Given], command: Command) -> dict[str, str]:
+def _check(given: Sequence[flags.Given], command: Command) -> dict[str, str]:
     texts = {g.name: g.text for g in given if g.name in command.flags}
     for name, text in texts.items():
         command.flags[name].convert(text)

@@ -17,12 +17,10 @@ from typing import TYPE_CHECKING, Any, Self
 from maplab_py.cancellation import current_token, lasting_effect
 from maplab_py.console.commands.lines import split_commands
 from maplab_py.console.commands.registry import Registry, load_registry
+from maplab_py.console.session import jobs, log, provenance, settings
 from maplab_py.console.session.call import Call, call_from_keywords, call_from_words
 from maplab_py.console.session.context import CommandContext
-from maplab_py.console.session.jobs import Job, JobBoard
 from maplab_py.console.session.maps import MapEntry, MapManager, MapsState, merge_states
-from maplab_py.console.session.provenance import Provenance
-from maplab_py.console.session.settings import Layer, Setting, Settings
 from maplab_py.console.terminal.protocol import SilentTerminal, Terminal
 from maplab_py.errors import EstimationError
 from maplab_py.memory import memory_limited
@@ -34,8 +32,6 @@ if TYPE_CHECKING:
 import logging
 from functools import partial
 from typing import TYPE_CHECKING, Protocol, TypeVar, runtime_checkable
-
-from maplab_py.console.session.log import log_path
 
 MEASURED = "accuracy"
 """Key in `Session.results`, with that of a map: a weak reference to its value, and its accuracy in words."""
@@ -90,15 +86,15 @@ class Session:
         self.registry = load_registry() if registry is None else registry
         self.terminal: Terminal = SilentTerminal() if terminal is None else terminal
         self.maps = MapManager()
-        self.settings = Settings(self.registry)
+        self.settings = settings.Settings(self.registry)
         self.timings: list[Timing] = []
-        self.jobs = JobBoard()
+        self.jobs = jobs.JobBoard()
         self.aliases: dict[str, str] = {}
         self.uses: Counter[str] = Counter()  # how often each command was typed
         self.variables: dict[str, str] = {}  # $NAME in typed lines, before the environment's
         self.marks: dict[str, str] = {}  # shown around the prompt: the sheep, a viewer's address
         self.refusal: Refusal | None = None  # the last one that a command can mend
-        self.provenance = Provenance()
+        self.provenance = provenance.Provenance()
         self.results: dict[Hashable, object] = {}  # what commands compare their next result with
         self.lock = threading.RLock()  # held while a command of the foreground runs
         self._is_draft = False  # what a running command sees of the session
@@ -203,13 +199,13 @@ class Session:
                     f"{call.command.name}: {report.failure}", remedy=report.remedy
                 )
 
-    def set_flags(self, assignments: Sequence[str]) -> list[Setting]:
+    def set_flags(self, assignments: Sequence[str]) -> list[settings.Setting]:
         """Set flags for the rest of the session, all or none of them.
 
         Raises:
             FlagError: A flag is unknown, or no command with this flag takes the value.
         """
-        return self.settings.assign(assignments, Layer.SET, "set")
+        return self.settings.assign(assignments, settings.Layer.SET, "set")
 
     def execute(self, call: Call) -> Report:
         """Run a call as a transaction: if it fails or is cancelled, all maps are as before."""
@@ -271,12 +267,12 @@ class Session:
             return ""
         return str(measured[1])
 
-    def start(self, command: str, *words: str, **flags: Any) -> Job:
+    def start(self, command: str, *words: str, **flags: Any) -> jobs.Job:
         """Start a command in the background; see `run`. The job knows its state and its report."""
         call = call_from_keywords(self.registry.find(command), words, flags, self.settings)
         return self.start_call(call, call.command.name)
 
-    def start_call(self, call: Call, text: str) -> Job:
+    def start_call(self, call: Call, text: str) -> jobs.Job:
         """Start a call in the background, on the maps as they are now.
 
         Raises:
@@ -427,6 +423,6 @@ class Watchers:
             logger.exception("the %s failed", name)
             if name not in self._told:
                 self._told.add(name)
-                self._say(f"the {name} could not follow the map (see {log_path()})")
+                self._say(f"the {name} could not follow the map (see {log.log_path()})")
             return False
         return True

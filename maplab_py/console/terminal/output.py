@@ -16,9 +16,7 @@ from typing import IO, TYPE_CHECKING, Any, TextIO
 
 from maplab_py import kernel_cache
 from maplab_py.cancellation import current_token
-from maplab_py.console.terminal.drawing import folded, plain_text
-from maplab_py.console.terminal.foreground import in_waiting_thread, interruptible, terminal_lent
-from maplab_py.console.terminal.layout import blocks_of
+from maplab_py.console.terminal import drawing, foreground, layout, streams
 from maplab_py.console.terminal.render import (
     render,
     render_json,
@@ -28,7 +26,6 @@ from maplab_py.console.terminal.render import (
     wants_colour,
     with_names,
 )
-from maplab_py.console.terminal.streams import write_message, writing_output
 from maplab_py.errors import Cancelled, UserError
 from maplab_py.progress import Progress
 from maplab_py.report import Report
@@ -108,7 +105,7 @@ class TerminalProgress:
             if self._bar is not None:
                 self._bar.console.print(text, markup=False, highlight=False)
             else:
-                write_message(self._stream, text)
+                streams.write_message(self._stream, text)
 
     def check(self) -> None:
         """Raise Cancelled when the user has asked to stop."""
@@ -219,7 +216,7 @@ class ConsoleTerminal:
             Cancelled: The answer is Ctrl-C.
         """
         self._hide_progress()
-        answer = in_waiting_thread(lambda: self._answer(f"{question} [y/N] "))
+        answer = foreground.in_waiting_thread(lambda: self._answer(f"{question} [y/N] "))
         return answer.strip().lower() in ("y", "yes")
 
     def choose(self, question: str, answers: tuple[str, ...]) -> str:
@@ -231,7 +228,7 @@ class ConsoleTerminal:
         self._hide_progress()
         letters = "/".join(answer[0] for answer in answers)
         while True:
-            text = in_waiting_thread(lambda: self._answer(f"{question} [{letters}] "))
+            text = foreground.in_waiting_thread(lambda: self._answer(f"{question} [{letters}] "))
             if not text:
                 raise Cancelled("cancelled: the input has ended")
             given = text.strip().lower()
@@ -244,7 +241,7 @@ class ConsoleTerminal:
         sys.stderr.write(prompt)
         sys.stderr.flush()
         try:
-            with interruptible():
+            with foreground.interruptible():
                 text = sys.stdin.readline()
         except KeyboardInterrupt:
             raise Cancelled("cancelled") from None
@@ -257,11 +254,11 @@ class ConsoleTerminal:
         with self._output() as out:
             if self.as_json:
                 render_json(report, command, seconds, out)
-            elif blocks_of(report) and not self._page(report):
+            elif layout.blocks_of(report) and not self._page(report):
                 render(report, out, self.mission_names(), self.page_of_ids())
         if self._transcript is not None:
-            blocks = with_names(blocks_of(report), self.mission_names())
-            self._copy("\n\n".join(plain_text(block) for block in blocks))
+            blocks = with_names(layout.blocks_of(report), self.mission_names())
+            self._copy("\n\n".join(drawing.plain_text(block) for block in blocks))
 
     def failed(self, text: str, command: str, status: int) -> None:
         """Report that a command failed: a line on standard error, with --json also an object."""
@@ -277,7 +274,7 @@ class ConsoleTerminal:
         if self._out is not None:
             yield self._out
             return
-        with writing_output():
+        with streams.writing_output():
             yield sys.stdout
 
     def tick(self) -> None:
@@ -380,9 +377,9 @@ class ConsoleTerminal:
 
 def _write_line(stream: TextIO, text: str, colour: str) -> None:
     if stream.isatty():
-        text = folded(text, shutil.get_terminal_size().columns)
+        text = drawing.folded(text, shutil.get_terminal_size().columns)
     line = f"{colour}{text}\x1b[0m" if wants_colour(stream) else text
-    write_message(stream, line)
+    streams.write_message(stream, line)
 
 
 PAGER_VARIABLE = "MAPLAB_PAGER"
@@ -415,7 +412,7 @@ def page(text: str) -> bool:
     if keys_are_waiting():
         return False
     sys.stdout.flush()
-    with terminal_lent():
+    with foreground.terminal_lent():
         subprocess.run(pager, shell=True, input=text, text=True, check=False)
     return True
 

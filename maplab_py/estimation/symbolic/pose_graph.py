@@ -11,14 +11,7 @@ from typing import Any
 
 import casadi
 
-from maplab_py.estimation.symbolic.manifold import (
-    conjugate,
-    exp,
-    log,
-    multiply,
-    rotation_matrix,
-    skew,
-)
+from maplab_py.estimation.symbolic import manifold
 
 ca: Any = casadi  # its stubs do not know mixed arguments
 SX = Any
@@ -31,7 +24,7 @@ _SMALL_SQUARED_ANGLE = 1e-4
 
 def split_error(q_A_B: SX, p_A_B: SX, measured: SX) -> SX:
     """Return [p_A_B - p_measured, Log(R_measured^T R_A_B)], the position part in A."""
-    angle = log(multiply(conjugate(measured[:4]), q_A_B))
+    angle = manifold.log(manifold.multiply(manifold.conjugate(measured[:4]), q_A_B))
     return ca.vertcat(p_A_B - measured[4:], angle)
 
 
@@ -40,8 +33,8 @@ def logarithmic_error(q_A_B: SX, p_A_B: SX, measured: SX) -> SX:
 
     Source: Barfoot, State Estimation for Robotics, 2017, eq. (7.37) and (7.86b).
     """
-    angle = log(multiply(conjugate(measured[:4]), q_A_B))
-    p = rotation_matrix(measured[:4]).T @ (p_A_B - measured[4:])
+    angle = manifold.log(manifold.multiply(manifold.conjugate(measured[:4]), q_A_B))
+    p = manifold.rotation_matrix(measured[:4]).T @ (p_A_B - measured[4:])
     once = ca.cross(angle, p)
     twice = ca.cross(angle, once)
     return ca.vertcat(p - 0.5 * once + _second_coefficient(angle) * twice, angle)
@@ -95,7 +88,9 @@ def tilt() -> Any:
     """
     T_G_I, measured, x = ca.SX.sym("T_G_I", 7), ca.SX.sym("q_G_I", 4), ca.SX.sym("x", 6)
     q, _ = _moved(T_G_I[:4], T_G_I[4:], x)
-    rotated = rotation_matrix(measured) @ log(multiply(conjugate(measured), q))
+    rotated = manifold.rotation_matrix(measured) @ manifold.log(
+        manifold.multiply(manifold.conjugate(measured), q)
+    )
     results = [_at_zero(result, x) for result in (rotated[:2], ca.jacobian(rotated[:2], x))]
     return ca.Function("tilt", [T_G_I, measured], ca.cse([ca.densify(r) for r in results]))
 
@@ -111,16 +106,16 @@ def retraction() -> Any:
         + 2 * half_sine * half_sine * ca.cross(w, v)
         + (angle - ca.sin(angle)) / (angle * angle * angle) * ca.cross(w, ca.cross(w, v))
     )
-    q = multiply(T[:4], exp(w))
-    moved = ca.vertcat(q / ca.sqrt(ca.dot(q, q)), T[4:] + rotation_matrix(T[:4]) @ p)
+    q = manifold.multiply(T[:4], manifold.exp(w))
+    moved = ca.vertcat(q / ca.sqrt(ca.dot(q, q)), T[4:] + manifold.rotation_matrix(T[:4]) @ p)
     return ca.Function("retraction", [T, x], ca.cse([moved]))
 
 
 def _symbols() -> tuple[SX, SX, SX, SX, SX, SX]:
     """Return T_A, T_B, T_measured, the relative pose q_A_B and p_A_B, and the twist x of B."""
     T_A, T_B, measured = (ca.SX.sym(name, 7) for name in ("T_A", "T_B", "T_measured"))
-    q_A_B = multiply(conjugate(T_A[:4]), T_B[:4])
-    p_A_B = rotation_matrix(T_A[:4]).T @ (T_B[4:] - T_A[4:])
+    q_A_B = manifold.multiply(manifold.conjugate(T_A[:4]), T_B[:4])
+    p_A_B = manifold.rotation_matrix(T_A[:4]).T @ (T_B[4:] - T_A[4:])
     return T_A, T_B, measured, q_A_B, p_A_B, ca.SX.sym("x", 6)
 
 
@@ -128,13 +123,13 @@ def _moved(q: SX, p: SX, x: SX) -> tuple[SX, SX]:
     """Return q and p of T exp(x), exact to second order."""
     v, w = x[:3], x[3:]
     step = ca.vertcat(0.5 * w, 1 - ca.dot(w, w) / 8)
-    return multiply(q, step), p + rotation_matrix(q) @ (v + 0.5 * ca.cross(w, v))
+    return manifold.multiply(q, step), p + manifold.rotation_matrix(q) @ (v + 0.5 * ca.cross(w, v))
 
 
 def _adjoint_of_inverse(q_A_B: SX, p_A_B: SX) -> SX:
     """Return the matrix (6 x 6) that takes twists of A to those of B with the same effect."""
-    R_B_A = rotation_matrix(q_A_B).T
-    top, bottom = ca.horzcat(R_B_A, -R_B_A @ skew(p_A_B)), ca.horzcat(ca.SX(3, 3), R_B_A)
+    R_B_A = manifold.rotation_matrix(q_A_B).T
+    top, bottom = ca.horzcat(R_B_A, -R_B_A @ manifold.skew(p_A_B)), ca.horzcat(ca.SX(3, 3), R_B_A)
     return ca.vertcat(top, bottom)
 
 

@@ -7,14 +7,7 @@ import numpy as np
 import scipy.linalg.lapack
 
 from maplab_py.array_types import F64, I64
-from maplab_py.estimation.kernels.window_arguments import (
-    FRAME_SIZE,
-    DenseSystem,
-    Elimination,
-    WindowData,
-    WindowPoint,
-    WindowRule,
-)
+from maplab_py.estimation.kernels import window_arguments
 from maplab_py.estimation.linear.protocol import NotPositiveDefinite
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.problem.protocol import Step
@@ -33,9 +26,9 @@ _LANDMARK_DAMPING, _NEARLY_UNDAMPED = 1e-12, 1e-4
 class WindowLinearization:
     """Normal equations at some states, and what is needed to step the landmarks."""
 
-    system: DenseSystem
-    kept: Elimination
-    rule: WindowRule
+    system: window_arguments.DenseSystem
+    kept: window_arguments.Elimination
+    rule: window_arguments.WindowRule
     costs: dict[str, float]
     of_map: MapElimination | None = None
 
@@ -46,7 +39,7 @@ class WindowProblem:
     def __init__(
         self,
         kernels: ModuleType,
-        data: WindowData,
+        data: window_arguments.WindowData,
         calibration: WindowCalibration,
         factors: FrameFactors,
         prior: WindowPrior,
@@ -137,7 +130,7 @@ class WindowProblem:
             NotPositiveDefinite: The measurements do not determine them.
         """
         size = len(linear.system.matrix)
-        of_frame = FRAME_SIZE * frame + np.arange(FRAME_SIZE)
+        of_frame = window_arguments.FRAME_SIZE * frame + np.arange(window_arguments.FRAME_SIZE)
         rows = np.concatenate([of_frame, np.arange(size - 6, size)])
         return self._covariance(linear, rows)
 
@@ -167,7 +160,9 @@ class WindowProblem:
         Raises:
             NotPositiveDefinite: The measurements do not determine the frames.
         """
-        return self._covariance(linear, FRAME_SIZE * frame + np.arange(FRAME_SIZE))
+        return self._covariance(
+            linear, window_arguments.FRAME_SIZE * frame + np.arange(window_arguments.FRAME_SIZE)
+        )
 
     def covariance_of_calibration(self, linear: WindowLinearization) -> F64:
         """Return the covariance (K, K) of the calibration.
@@ -175,7 +170,7 @@ class WindowProblem:
         Raises:
             NotPositiveDefinite: The measurements do not determine the states.
         """
-        first = FRAME_SIZE * linear.kept.Y.shape[1]
+        first = window_arguments.FRAME_SIZE * linear.kept.Y.shape[1]
         return self._covariance(linear, first + np.arange(len(self._calibration)))
 
     def newest_covariance(self, states: WindowStates) -> F64:
@@ -183,7 +178,7 @@ class WindowProblem:
         try:
             return self.covariance(self.undamped_near(states), len(states) - 1)
         except NotPositiveDefinite:
-            return np.full((FRAME_SIZE, FRAME_SIZE), np.inf)
+            return np.full((window_arguments.FRAME_SIZE, window_arguments.FRAME_SIZE), np.inf)
 
     def scale_sigma(self, states: WindowStates) -> float:
         """Return the standard deviation of the scale of the positions, as a share; infinite = unknown."""
@@ -191,7 +186,7 @@ class WindowProblem:
             covariance = self.covariance_of_frames(self.undamped_near(states))
         except NotPositiveDefinite:
             return float("inf")
-        size = FRAME_SIZE * len(states)
+        size = window_arguments.FRAME_SIZE * len(states)
         return scale_sigma(states.T_M_I[:, 4:], covariance[:size, :size])
 
     def calibration_sigma(self, states: WindowStates) -> F64:
@@ -212,13 +207,15 @@ class WindowProblem:
     def _linearize(self, states: WindowStates, damping: float, part: Part) -> WindowLinearization:
         frames, landmarks = len(states), len(states.h)
         count = len(states.calibration)
-        system = DenseSystem.zeros(FRAME_SIZE * frames + count + 6 * len(states.T_G_M))
-        kept = Elimination.empty(landmarks, frames, count)
+        system = window_arguments.DenseSystem.zeros(
+            window_arguments.FRAME_SIZE * frames + count + 6 * len(states.T_G_M)
+        )
+        kept = window_arguments.Elimination.empty(landmarks, frames, count)
         at, is_elsewhere = states, np.zeros(frames, dtype=np.bool_)
         fixed = self._prior.is_fixed
         if fixed.any() or self._prior.is_base_fixed:
             at, is_elsewhere = self._prior.linearization_point(states), fixed
-        rule = WindowRule(int(self._loss), float(damping), at.T_M_I, is_elsewhere)
+        rule = window_arguments.WindowRule(int(self._loss), float(damping), at.T_M_I, is_elsewhere)
         rho = self._kernels.eliminate(self._data, self._point(states), rule, system, kept)
         costs = {"visual": 0.5 * float(rho), **self._factors.add_to(system, states, at, part)}
         residual, information, gradient = self._prior.linearized(states)
@@ -233,10 +230,10 @@ class WindowProblem:
         np.add(system.reduced_gradient, system.gradient, out=system.reduced_gradient)
         return WindowLinearization(system, kept, rule, costs, of_map)
 
-    def _point(self, states: WindowStates) -> WindowPoint:
+    def _point(self, states: WindowStates) -> window_arguments.WindowPoint:
         twist = np.zeros((0, 7)) if self._times is None else self._times.twist(states)
         cameras = self._calibration.of_kernels(states.calibration)
-        return WindowPoint(states.T_M_I, states.h, cameras, twist)
+        return window_arguments.WindowPoint(states.T_M_I, states.h, cameras, twist)
 
     @staticmethod
     def _solved(factor: F64, right: F64) -> F64:
@@ -252,5 +249,5 @@ def _factorised(matrix: F64) -> F64:
     """
     factor, info = scipy.linalg.lapack.dpotrf(matrix.T, lower=0, clean=0, overwrite_a=1)
     if info > 0:
-        raise NotPositiveDefinite((info - 1) // FRAME_SIZE)
+        raise NotPositiveDefinite((info - 1) // window_arguments.FRAME_SIZE)
     return np.asarray(factor)

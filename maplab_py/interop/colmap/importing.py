@@ -16,13 +16,9 @@ from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import interpolation, se3, so3
 from maplab_py.geometry.alignment import apply_similarity, umeyama
 from maplab_py.input_files import read_foreign_text
-from maplab_py.interop.colmap.child_process import run_job, write_job_model
-from maplab_py.interop.colmap.features import with_features, with_images
+from maplab_py.interop.colmap import child_process, features, reading, to_map, undistortion
 from maplab_py.interop.colmap.model import MODELS, ColmapModel, SensorType, SideFile, has_model
 from maplab_py.interop.colmap.options import ColmapImportOptions, ColmapImportReport
-from maplab_py.interop.colmap.reading import read_model
-from maplab_py.interop.colmap.to_map import BodyFrames, body_frames, map_of_model, side_images
-from maplab_py.interop.colmap.undistortion import perspective_model
 from maplab_py.interop.stamps import IMAGES, parse_stamps
 from maplab_py.interop.trajectories import Trajectory, read_trajectory
 from maplab_py.progress import SILENT, Progress
@@ -48,7 +44,7 @@ def import_colmap(
     options = options or ColmapImportOptions()
     if options.align_to and (options.scale or options.gravity):
         raise UserError("--align_to gives scale and gravity: leave --scale and --gravity out")
-    model, differing = with_poses(read_model(folder), options.colmap_poses)
+    model, differing = with_poses(reading.read_model(folder), options.colmap_poses)
     notes, recorded_uv = [differing] if differing else [], model.images.uv
     if options.undistort and not all(has_model(camera) for camera in model.cameras):
         if options.images:
@@ -59,9 +55,9 @@ def import_colmap(
         model = _perspective(model, folder)
     side = SideFile.read(folder)
     times_ns = _times(model, side, options)
-    bodies = body_frames(model, times_ns, side)
+    bodies = to_map.body_frames(model, times_ns, side)
     placing = _place(model, bodies, options)
-    imported = map_of_model(
+    imported = to_map.map_of_model(
         model,
         bodies,
         times_ns,
@@ -78,10 +74,10 @@ def import_colmap(
     names = [model.images.name[row] for row in imported.images.tolist()]
     if database is not None:
         uv = recorded_uv[imported.keypoints]
-        vi_map, said = with_features(vi_map, names, uv, database, progress=progress)
+        vi_map, said = features.with_features(vi_map, names, uv, database, progress=progress)
         notes += said
     if options.images:
-        vi_map, attached = with_images(
+        vi_map, attached = features.with_images(
             vi_map, names, Path(options.images), link=options.link_images, progress=progress
         )
     return vi_map, ColmapImportReport(
@@ -104,7 +100,7 @@ def _times(model: ColmapModel, side: SideFile | None, options: ColmapImportOptio
     """Return the times (N,) of images; the side file has those of its images."""
     known = np.full(len(model.images.id), -1, dtype=np.int64)
     if side is not None and options.timestamps_from == "name":
-        known = side_images(model, side)
+        known = to_map.side_images(model, side)
     times_ns = np.zeros(len(known), dtype=np.int64)
     if side is not None:
         times_ns[known >= 0] = side.image_time_ns[known[known >= 0]]
@@ -121,7 +117,7 @@ def _times(model: ColmapModel, side: SideFile | None, options: ColmapImportOptio
     return times_ns
 
 
-def _place(model: ColmapModel, bodies: BodyFrames, options: ColmapImportOptions) -> Placing:
+def _place(model: ColmapModel, bodies: to_map.BodyFrames, options: ColmapImportOptions) -> Placing:
     if options.align_to:
         trajectory = read_trajectory(Path(options.align_to))
         return place_by_trajectory(bodies.time_ns, bodies.T_W_R, bodies.T_R_I, trajectory)
@@ -129,7 +125,7 @@ def _place(model: ColmapModel, bodies: BodyFrames, options: ColmapImportOptions)
 
 
 def _metric_missions(
-    bodies: BodyFrames, side: SideFile | None, placing: Placing, options: ColmapImportOptions
+    bodies: to_map.BodyFrames, side: SideFile | None, placing: Placing, options: ColmapImportOptions
 ) -> Mask:
     """Return the missions (M,) whose scale and gravity are known."""
     metric = np.full(len(bodies.mission_rig), placing.is_metric, dtype=np.bool_)
@@ -148,8 +144,10 @@ def _perspective(model: ColmapModel, folder: Path) -> ColmapModel:
             )
     with tempfile.TemporaryDirectory(prefix="maplab-colmap-") as name:
         work = Path(name)
-        write_job_model(model, work)
-        return perspective_model(model, work, lambda: run_job("undistort", work, folder))
+        child_process.write_job_model(model, work)
+        return undistortion.perspective_model(
+            model, work, lambda: child_process.run_job("undistort", work, folder)
+        )
 
 
 def _notes(vi_map: VIMap, side: SideFile | None) -> tuple[str, ...]:

@@ -11,11 +11,7 @@ from maplab_py.interop.bags.sensor_messages import CLOUD, MessageMaker
 from maplab_py.interop.live.options import LiveOptions
 from maplab_py.interop.live.transport import Transport
 from maplab_py.interop.ply import PlyCloud
-from maplab_py.interop.recordings.bag_layouts import (
-    odometry_messages,
-    pose_messages,
-    tf_messages,
-)
+from maplab_py.interop.recordings import bag_layouts
 
 ODOMETRY_TOPIC, ODOMETRY_TYPE = "/maplab/odometry", "nav_msgs/msg/Odometry"
 POSE_TOPIC, POSE_TYPE = "/maplab/pose_in_map", "geometry_msgs/msg/PoseStamped"
@@ -53,7 +49,7 @@ class PosePublisher:
         times_ns = np.array([estimate.time_ns])
         T_M_I = estimate.T_M_I[None]
         pose_covariance, twist_covariance = ros_covariances(estimate)
-        odometry = odometry_messages(
+        odometry = bag_layouts.odometry_messages(
             times_ns,
             T_M_I,
             estimate.v_M_I[None],
@@ -69,9 +65,11 @@ class PosePublisher:
             T_G_M = estimate.T_G_M[None]
             transforms.insert(0, (T_G_M, (options.world_frame, options.odom_frame)))
             T_G_I = se3.compose(T_G_M, T_M_I)
-            poses = pose_messages(times_ns, T_G_I, options.world_frame, is_ros_2=is_ros_2)
+            poses = bag_layouts.pose_messages(
+                times_ns, T_G_I, options.world_frame, is_ros_2=is_ros_2
+            )
             self._pose(poses[0])
-        self._transforms(tf_messages(times_ns, transforms, is_ros_2=is_ros_2)[0])
+        self._transforms(bag_layouts.tf_messages(times_ns, transforms, is_ros_2=is_ros_2)[0])
 
     def publish_landmarks(self, time_ns: int, p_M: F64) -> None:
         """Publish landmarks (L, 3), if the user wants them."""

@@ -8,15 +8,7 @@ import numpy as np
 
 from maplab_py.array_types import U64, NDArray
 from maplab_py.storage import maplab_map_pb2 as pb
-from maplab_py.storage.protobuf.file_contents import (
-    Columns,
-    FileContent,
-    Groups,
-    extend_finite,
-    merge_unknown,
-    starts,
-    words,
-)
+from maplab_py.storage.protobuf import file_contents
 from maplab_py.storage.protobuf.map_files import FileKind
 from maplab_py.storage.protobuf.tables_from_messages import SENSOR_FIELDS
 from maplab_py.storage.protobuf.vertices_to_messages import id_rows, tag_of, vertices_to_bytes
@@ -59,26 +51,30 @@ def _portions(counts: Sequence[int], most: int) -> list[range]:
     return portions or [range(0)]
 
 
-def contents(vi_map: VIMap, partition: Partition) -> Iterator[FileContent]:
+def contents(vi_map: VIMap, partition: Partition) -> Iterator[file_contents.FileContent]:
     """Yield the files of a map; that of the missions is written apart (`missions`)."""
     vertices = VertexColumns(vi_map)
     for index, rows in enumerate(partition.vertex_rows(vi_map)):
         name, columns = f"vertices{index}", vertices.of(rows)
-        yield FileContent(FileKind.VERTICES, name, columns, vertices_to_bytes, MEASUREMENTS)
+        yield file_contents.FileContent(
+            FileKind.VERTICES, name, columns, vertices_to_bytes, MEASUREMENTS
+        )
     for index, rows in enumerate(partition.edge_rows(vi_map)):
         name, columns = f"edges{index}", edge_columns(vi_map, rows)
-        yield FileContent(FileKind.EDGES, name, columns, edges_to_bytes, SAMPLES)
+        yield file_contents.FileContent(FileKind.EDGES, name, columns, edges_to_bytes, SAMPLES)
     landmarks = vi_map.landmarks
     columns = {"landmark_id": landmarks.id, "vertex_id": vi_map.vertices.id[landmarks.vertex]}
-    yield FileContent(FileKind.LANDMARK_INDEX, "landmark_index", columns, index_to_bytes)
+    yield file_contents.FileContent(
+        FileKind.LANDMARK_INDEX, "landmark_index", columns, index_to_bytes
+    )
 
 
 def missions(vi_map: VIMap) -> pb.VIMap:
     """Return the message with missions and base frames."""
     message = pb.VIMap()
     table = vi_map.missions
-    frame_words = words(vi_map.baseframes.id)
-    for row, id_words in enumerate(words(table.id)):
+    frame_words = file_contents.words(vi_map.baseframes.id)
+    for row, id_words in enumerate(file_contents.words(table.id)):
         message.mission_ids.add().words.extend(id_words)
         mission = message.missions.add()
         mission.baseframe_id.words.extend(frame_words[table.baseframe[row]])
@@ -86,20 +82,20 @@ def missions(vi_map: VIMap) -> pb.VIMap:
             root = vi_map.vertices.id[table.root_vertex[row]]
             mission.root_vertex_id.words.extend(root.byteswap().tolist())
         mission.backbone = int(table.backbone[row])
-        sensor_words = words(table.sensor_id[row])
+        sensor_words = file_contents.words(table.sensor_id[row])
         for kind, field in SENSOR_FIELDS.items():
             if any(sensor_words[kind]):
                 getattr(mission, field).words.extend(sensor_words[kind])
-        merge_unknown(mission, table.unknown[row])
+        file_contents.merge_unknown(mission, table.unknown[row])
     _mission_resources(vi_map, message)
     frames = vi_map.baseframes
     for row, id_words in enumerate(frame_words):
         message.baseframe_ids.add().words.extend(id_words)
         frame = message.baseframes.add()
         frame.T_G_M.extend(frames.T_G_M[row].tolist())
-        extend_finite(frame.T_G_M_covariance, frames.T_G_M_covariance[row])
+        file_contents.extend_finite(frame.T_G_M_covariance, frames.T_G_M_covariance[row])
         frame.is_T_G_M_known = bool(frames.is_known[row])
-        merge_unknown(frame, frames.unknown[row])
+        file_contents.merge_unknown(frame, frames.unknown[row])
     return message
 
 
@@ -151,7 +147,7 @@ def edge_counts(vi_map: VIMap) -> tuple[int, int, int]:
     return len(vi_map.imu_edges), len(vi_map.transformation_edges), len(vi_map.loop_closure_edges)
 
 
-def edge_columns(vi_map: VIMap, rows: range) -> Columns:
+def edge_columns(vi_map: VIMap, rows: range) -> file_contents.Columns:
     """Return the columns of edges, which are counted in the order of `edge_counts`."""
     ends = np.cumsum(edge_counts(vi_map))
     imu, relative, loops = (
@@ -174,7 +170,7 @@ def edge_columns(vi_map: VIMap, rows: range) -> Columns:
     }
 
 
-def edges_to_bytes(columns: Columns) -> bytes:
+def edges_to_bytes(columns: file_contents.Columns) -> bytes:
     """Return the bytes of a file of edges."""
     message = pb.VIMap()
     _add_imu_edges(message, columns)
@@ -201,10 +197,10 @@ def _part(prefix: str, table: Any, names: tuple[str, ...], rows: Any) -> dict[st
 class _Ends:
     """Adds edges with the ids of their ends."""
 
-    def __init__(self, message: pb.VIMap, columns: Columns, prefix: str) -> None:
+    def __init__(self, message: pb.VIMap, columns: file_contents.Columns, prefix: str) -> None:
         self._message = message
         names = ("id", "from_id", "to_id", "mission_id")
-        lists = [words(columns[f"{prefix}.{name}"]) for name in names]
+        lists = [file_contents.words(columns[f"{prefix}.{name}"]) for name in names]
         self._rows = list(zip(*lists, strict=True))
 
     def __len__(self) -> int:
@@ -221,37 +217,37 @@ class _Ends:
         return message
 
 
-def _add_imu_edges(message: pb.VIMap, columns: Columns) -> None:
+def _add_imu_edges(message: pb.VIMap, columns: file_contents.Columns) -> None:
     ends = _Ends(message, columns, "imu")
-    start = starts(columns["imu.sample_count"])
+    start = file_contents.starts(columns["imu.sample_count"])
     for row in range(len(ends)):
         imu = ends.add(row, "imu")
         samples = slice(start[row], start[row + 1])
         imu.timestamps_ns.extend(columns["sample.timestamp_ns"][samples].tolist())
         imu.accel_gyro.extend(columns["sample.accel_gyro"][samples].reshape(-1).tolist())
-        merge_unknown(imu, columns["imu.unknown"][row])
+        file_contents.merge_unknown(imu, columns["imu.unknown"][row])
 
 
-def _add_transformations(message: pb.VIMap, columns: Columns) -> None:
+def _add_transformations(message: pb.VIMap, columns: file_contents.Columns) -> None:
     ends = _Ends(message, columns, "relative")
-    sensor_words = words(columns["relative.sensor_id"])
+    sensor_words = file_contents.words(columns["relative.sensor_id"])
     for row in range(len(ends)):
         relative = ends.add(row, _FIELDS[TransformationKind(columns["relative.kind"][row])])
         relative.T_A_B.extend(columns["relative.T_A_B"][row].tolist())
-        extend_finite(relative.covariance, columns["relative.covariance"][row])
+        file_contents.extend_finite(relative.covariance, columns["relative.covariance"][row])
         relative.sensor_id.words.extend(sensor_words[row])
-        merge_unknown(relative, columns["relative.unknown"][row])
+        file_contents.merge_unknown(relative, columns["relative.unknown"][row])
 
 
-def _add_loop_closures(message: pb.VIMap, columns: Columns) -> None:
+def _add_loop_closures(message: pb.VIMap, columns: file_contents.Columns) -> None:
     ends = _Ends(message, columns, "loop")
     for row in range(len(ends)):
         loop = ends.add(row, "loop_closure")
         loop.T_A_B.extend(columns["loop.T_A_B"][row].tolist())
-        extend_finite(loop.covariance, columns["loop.covariance"][row])
+        file_contents.extend_finite(loop.covariance, columns["loop.covariance"][row])
         loop.switch_variable = float(columns["loop.switch_variable"][row])
         loop.switch_variable_variance = float(columns["loop.switch_variable_variance"][row])
-        merge_unknown(loop, columns["loop.unknown"][row])
+        file_contents.merge_unknown(loop, columns["loop.unknown"][row])
 
 
 _VERTICES = ("id", "T_M_I", "v_M", "accel_bias", "gyro_bias", "nframe_id", "unknown")
@@ -289,15 +285,19 @@ class VertexColumns:
         count = len(vi_map.vertices)
         edges = (vi_map.imu_edges, vi_map.transformation_edges, vi_map.loop_closure_edges)
         self._edge_id = np.concatenate([table.id for table in edges])
-        self._incoming = Groups.of(np.concatenate([table.to_vertex for table in edges]), count)
-        self._outgoing = Groups.of(np.concatenate([table.from_vertex for table in edges]), count)
-        self._stored = Groups.of(vi_map.landmarks.vertex, count)
-        self._absolute = Groups.of(vi_map.absolute_poses.vertex, count)
+        self._incoming = file_contents.Groups.of(
+            np.concatenate([table.to_vertex for table in edges]), count
+        )
+        self._outgoing = file_contents.Groups.of(
+            np.concatenate([table.from_vertex for table in edges]), count
+        )
+        self._stored = file_contents.Groups.of(vi_map.landmarks.vertex, count)
+        self._absolute = file_contents.Groups.of(vi_map.absolute_poses.vertex, count)
         resources = vi_map.resources
         owner = np.where(resources.owner_kind == ResourceOwner.FRAME, resources.owner, -1)
-        self._resources = Groups.of(owner, len(vi_map.frames))
+        self._resources = file_contents.Groups.of(owner, len(vi_map.frames))
 
-    def of(self, rows: range) -> Columns:
+    def of(self, rows: range) -> file_contents.Columns:
         """Return the columns of some vertices."""
         m = self._map
         frames = range(int(m.frame_start[rows.start]), int(m.frame_start[rows.stop]))
@@ -365,7 +365,7 @@ _VERTEX_TAG = tag_of(pb.LandmarkIndexEntry, "vertex_id")
 _LANDMARK_TAG = tag_of(pb.LandmarkIndexEntry, "landmark_id")
 
 
-def index_to_bytes(columns: Columns) -> bytes:
+def index_to_bytes(columns: file_contents.Columns) -> bytes:
     """Return the bytes of the index of landmarks (`landmark_id`) by their vertices (`vertex_id`)."""
     vertex, landmark = columns["vertex_id"], columns["landmark_id"]
     return b"".join(

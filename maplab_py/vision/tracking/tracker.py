@@ -13,12 +13,7 @@ from maplab_py.array_types import F32, F64, I64, U8, Mask
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3
 from maplab_py.sensors import Camera, Distortion, Projection
-from maplab_py.vision.features.detection import (
-    GridDetector,
-    are_apart,
-    are_apart_before,
-    refined,
-)
+from maplab_py.vision.features import detection
 from maplab_py.vision.tracking import patch_kernels, stereo_kernels
 from maplab_py.vision.tracking.flow import (
     FlowOptions,
@@ -169,7 +164,7 @@ class FrameTracker:
                 with watch("stereo"):
                     pair = prepared[leader], image
                     live[leader], shared = self._shared(leader, row, pair, live[leader])
-                    is_apart = are_apart(live[row].uv, shared.uv, _SAME_POINT_PX)
+                    is_apart = detection.are_apart(live[row].uv, shared.uv, _SAME_POINT_PX)
                     live[row] = live[row][is_apart]
             if row not in self._absent:
                 with watch("detect"):
@@ -187,12 +182,12 @@ class FrameTracker:
             self._options.descriptor_type,
         )
 
-    def _detector(self, row: int) -> GridDetector:
+    def _detector(self, row: int) -> detection.GridDetector:
         view, leader = self._views[row], self._leaders[row]
         usable = view.preparation.usable
         if leader != row:
             usable = usable_alone(view, self._views[leader])
-        return GridDetector(self._options, usable)
+        return detection.GridDetector(self._options, usable)
 
     def _follow(
         self, row: int, image: U8, R_I0_I1: F64 | None, seed: int, watch: _Stopwatch
@@ -250,9 +245,13 @@ class FrameTracker:
     ) -> LiveTracks:
         """Add new tracks where the image has room beside those of the camera and of its leader."""
         uv = self._detectors[row].detect(image, np.concatenate([shared.uv, tracks.uv]))
-        uv = refined(image, uv)
-        is_apart = are_apart(uv, tracks.uv, _SAME_POINT_PX)
-        uv = uv[self._views[row].is_usable(uv) & is_apart & are_apart_before(uv, _SAME_POINT_PX)]
+        uv = detection.refined(image, uv)
+        is_apart = detection.are_apart(uv, tracks.uv, _SAME_POINT_PX)
+        uv = uv[
+            self._views[row].is_usable(uv)
+            & is_apart
+            & detection.are_apart_before(uv, _SAME_POINT_PX)
+        ]
         ray, exists = self._views[row].rays(uv)
         new = LiveTracks.new(uv[exists], ray[exists], self._next_id)
         new = new.compared_with(patches(image, new.uv), new.warp)

@@ -20,10 +20,7 @@ from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.problem.gauge import clusters, first_of_each, fix_position_and_heading
 from maplab_py.estimation.problem.problem import Problem
 from maplab_py.estimation.states import ACCEL_BIAS, GYRO_BIAS, VELOCITY, States
-from maplab_py.estimation.terms.cameras import EXTRINSICS
-from maplab_py.estimation.terms.inertial import BiasWalkTerm
-from maplab_py.estimation.terms.prior import VertexVectorPrior
-from maplab_py.estimation.terms.protocol import FactorTerm, FixedMeasurements
+from maplab_py.estimation.terms import cameras, inertial, prior, protocol
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap, observer_counts, random_ids
 from maplab_py.vimap.edits import content_rng
@@ -32,7 +29,7 @@ from maplab_py.vimap.tables import NO_ROW
 from maplab_py.vimap.vertex_removal import move_landmarks
 
 
-class CalibrationPrior(FixedMeasurements):
+class CalibrationPrior(protocol.FixedMeasurements):
     """A weak prior on the calibration: one factor over all its parameters."""
 
     name = "calibration prior"
@@ -55,7 +52,7 @@ class CalibrationPrior(FixedMeasurements):
         return (change * self._weight)[None, :], self._jacobian
 
 
-class GapWalkTerm(BiasWalkTerm):
+class GapWalkTerm(inertial.BiasWalkTerm):
     """Random walk of the biases across the gaps between the segments of a mission."""
 
     name = "bias walk across gaps"
@@ -139,7 +136,7 @@ def vi_options(options: SelfCalibrationOptions, robust: bool = True) -> VIOptimi
     )
 
 
-def _motion_priors(parts: MapTerms, options: SelfCalibrationOptions) -> list[FactorTerm]:
+def _motion_priors(parts: MapTerms, options: SelfCalibrationOptions) -> list[protocol.FactorTerm]:
     """Return weak priors on biases and velocity of the first vertex of every run.
 
     They keep these determined where nothing moves.
@@ -148,7 +145,7 @@ def _motion_priors(parts: MapTerms, options: SelfCalibrationOptions) -> list[Fac
     first = parts.selection.rows(first_of_each(runs_of(parts.vi_map)))
     first = first[first >= 0]
     return [
-        VertexVectorPrior(kind, first, values[first], sigma)
+        prior.VertexVectorPrior(kind, first, values[first], sigma)
         for kind, values, sigma in (
             (GYRO_BIAS, states.gyro_bias, options.prior_gyro_bias_radps),
             (ACCEL_BIAS, states.accel_bias, options.prior_accel_bias_mps2),
@@ -157,7 +154,7 @@ def _motion_priors(parts: MapTerms, options: SelfCalibrationOptions) -> list[Fac
     ]
 
 
-def _gap_walks(parts: MapTerms, gaps: BiasGaps) -> list[FactorTerm]:
+def _gap_walks(parts: MapTerms, gaps: BiasGaps) -> list[protocol.FactorTerm]:
     """Return the random walk of the biases across gaps, if there are any."""
     before, after = parts.selection.rows(gaps.before), parts.selection.rows(gaps.after)
     inside = (before >= 0) & (after >= 0)
@@ -187,7 +184,7 @@ def _fix_gauge(problem: Problem, parts: MapTerms, parameters: Parameters, partit
     problem.restrict(nodes, is_free[nodes][:, :, None] * np.eye(3))
     first = first_of_each(partition[parts.selection.vertices])
     fix_position_and_heading(problem, states, first)
-    if EXTRINSICS not in states.blocks and not problem.factors:
+    if cameras.EXTRINSICS not in states.blocks and not problem.factors:
         raise EstimationError("nothing to calibrate: no camera has usable tracks")
     return held
 

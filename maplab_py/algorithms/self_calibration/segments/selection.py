@@ -10,21 +10,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.self_calibration import reports
-from maplab_py.algorithms.self_calibration.device import device_of, with_device_of
+from maplab_py.algorithms.self_calibration import device, reports, uncertainty
 from maplab_py.algorithms.self_calibration.estimation.parameters import Parameters
 from maplab_py.algorithms.self_calibration.estimation.problem import build_segment_problem
 from maplab_py.algorithms.self_calibration.options import GROUPS, SelfCalibrationOptions
+from maplab_py.algorithms.self_calibration.segments import splitting
 from maplab_py.algorithms.self_calibration.segments.database import (
     Key,
     SegmentDatabase,
     SegmentRecord,
 )
-from maplab_py.algorithms.self_calibration.segments.splitting import (
-    extract_submap,
-    split_into_segments,
-)
-from maplab_py.algorithms.self_calibration.uncertainty import posterior_covariance, score, spectrum
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.progress import SILENT, Progress
@@ -65,7 +60,9 @@ class Evaluation:
                 self.vi_map,
                 segment,
                 {
-                    table: score(segment.covariance, sigma_ref, of_group, options.metric)
+                    table: uncertainty.score(
+                        segment.covariance, sigma_ref, of_group, options.metric
+                    )
                     for table, of_group in rows.items()
                 },
             )
@@ -86,8 +83,8 @@ def evaluate(
         EstimationError: There is no segment.
         UserError: The missions were recorded with different devices.
     """
-    device_of(vi_map, missions)
-    segments = split_into_segments(vi_map, missions, options.segment_keyframes)
+    device.device_of(vi_map, missions)
+    segments = splitting.split_into_segments(vi_map, missions, options.segment_keyframes)
     if not segments:
         raise EstimationError(
             f"no mission has {options.segment_keyframes // 2 + 1} keyframes in a row that inertial "
@@ -98,7 +95,7 @@ def evaluate(
     parameters = Parameters(())
     for number, rows in enumerate(segments):
         progress.step(number, len(segments), "evaluate segments")
-        submap = extract_submap(vi_map, rows)
+        submap = splitting.extract_submap(vi_map, rows)
         segment_parameters, covariance = _information(submap, options)
         results.append((len(submap.landmarks), covariance))
         parameters = max(parameters, segment_parameters, key=len)
@@ -107,7 +104,7 @@ def evaluate(
     for rows, (landmarks, posterior) in zip(segments, results, strict=True):
         is_complete = posterior is not None and len(posterior) == len(parameters)
         covariance = posterior if posterior is not None and is_complete else prior
-        unobservable = spectrum(covariance, parameters).unobservable().shape[1]
+        unobservable = uncertainty.spectrum(covariance, parameters).unobservable().shape[1]
         evaluated.append(EvaluatedSegment(rows, landmarks, covariance, unobservable))
     seconds = time.perf_counter() - began
     return Evaluation(vi_map, parameters, tuple(evaluated), seconds / len(segments))
@@ -117,7 +114,7 @@ def _information(segment: VIMap, options: SelfCalibrationOptions) -> tuple[Param
     """Return the parameters of a segment and their covariance; None = it has no information."""
     try:
         problem = build_segment_problem(segment, options, robust=False)
-        return problem.parameters, posterior_covariance(problem, problem.states)
+        return problem.parameters, uncertainty.posterior_covariance(problem, problem.states)
     except EstimationError:
         return Parameters(()), None
 
@@ -210,10 +207,12 @@ def collect(
         EstimationError: There is no segment.
     """
     chosen = np.arange(len(vi_map.missions)) if missions is None else np.asarray(missions)
-    device_of(vi_map, chosen)
-    source = extract_submap(vi_map, np.flatnonzero(np.isin(vi_map.vertices.mission, chosen)))
+    device.device_of(vi_map, chosen)
+    source = splitting.extract_submap(
+        vi_map, np.flatnonzero(np.isin(vi_map.vertices.mission, chosen))
+    )
     if database is not None and len(database):
-        source = with_device_of(source, database.vi_map)
+        source = device.with_device_of(source, database.vi_map)
     evaluation = evaluate(source, options, progress=progress)
     if database is None or not len(database):
         database = empty_database(

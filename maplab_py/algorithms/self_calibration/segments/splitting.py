@@ -7,11 +7,7 @@ from numpy.typing import NDArray
 
 from maplab_py.array_types import I64, Mask
 from maplab_py.distinct import distinct
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.descriptors import no_blocks
-from maplab_py.vimap.selection import keep_rows, renumbering
-from maplab_py.vimap.tables import AbsolutePoses, LoopClosureEdges, Resources, TransformationEdges
-from maplab_py.vimap.vertex_removal import move_landmarks, stores_for
+from maplab_py.vimap import VIMap, descriptors, selection, tables, vertex_removal
 
 
 def split_into_segments(
@@ -50,15 +46,15 @@ def extract_submap(vi_map: VIMap, vertices: I64) -> VIMap:
     is_kept[vertices] = True
     tracks = _with_tracks_only(vi_map, is_kept)
     moved = np.flatnonzero(~is_kept[tracks.landmarks.vertex])
-    store = stores_for(tracks, moved, is_kept, same_mission=False)
-    tracks = move_landmarks(tracks, moved, store)
+    store = vertex_removal.stores_for(tracks, moved, is_kept, same_mission=False)
+    tracks = vertex_removal.move_landmarks(tracks, moved, store)
     missions = np.unique(vi_map.vertices.mission[vertices]).astype(np.int64)
-    result = keep_rows(tracks, missions=missions, vertices=np.flatnonzero(is_kept))
+    result = selection.keep_rows(tracks, missions=missions, vertices=np.flatnonzero(is_kept))
     return result.replace(
-        transformation_edges=TransformationEdges.empty(),
-        loop_closure_edges=LoopClosureEdges.empty(),
-        absolute_poses=AbsolutePoses.empty(),
-        resources=Resources.empty(),
+        transformation_edges=tables.TransformationEdges.empty(),
+        loop_closure_edges=tables.LoopClosureEdges.empty(),
+        absolute_poses=tables.AbsolutePoses.empty(),
+        resources=tables.Resources.empty(),
     )
 
 
@@ -71,13 +67,13 @@ def _with_tracks_only(vi_map: VIMap, is_kept: Mask) -> VIMap:
         distinct(pair) // max(len(vi_map.vertices), 1), minlength=len(vi_map.landmarks)
     )
     used = np.flatnonzero(observers >= 2)
-    new_row = renumbering(len(vi_map.landmarks), used)
+    new_row = selection.renumbering(len(vi_map.landmarks), used)
     rows = inside[new_row[landmark[inside]] >= 0]
     frames, table = vi_map.frames, vi_map.keypoints.take(rows)
     return vi_map.replace(
         frames=frames.replace(
             keypoint_count=np.bincount(vi_map.keypoint_frame[rows], minlength=len(frames)),
-            descriptor_blocks=no_blocks(len(frames)),
+            descriptor_blocks=descriptors.no_blocks(len(frames)),
         ),
         keypoints=table.replace(
             landmark=new_row[table.landmark],
