@@ -174,7 +174,7 @@ def run(
                 line |= recall(maps[name], simulated.vi_map, truth)
             begin = time.process_time()
             try:
-                whole, _ = merge_session(maps[name], session)
+                whole, *_ = merge_session(maps[name], session)
             except EstimationError as error:
                 write(line | {"refused": str(error)})
                 continue

@@ -5,17 +5,19 @@ from maplab_py.algorithms.keyframing.options import KeyframingOptions
 from maplab_py.algorithms.landmarks.persistence import PersistenceOptions
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.map_update.options import (
+    ChronicleReport,
     GatheringReport,
     MapUpdateReport,
     UpdateOptions,
 )
-from maplab_py.plugin import CommandContext, UserError, command
+from maplab_py.plugin import CommandContext, Message, UserError, command
 
 
 @command(
     "update_map",
     example="update_map --session=tuesday --max_landmarks=20000 --max_vertices=1000",
-    see_also=("gather_evidence", "landmark_sparsify", "compare_maps"),
+    see_also=("gather_evidence", "map_log", "compare_maps"),
+    reads=("session",),
 )
 def update_map(
     context: CommandContext,
@@ -74,16 +76,57 @@ def gather_evidence(
         date: Date of the probabilities that landmarks exist, as 2027-01-31; empty = the last session's.
         forget: Remove the evidence that the map has first.
     """
-    from datetime import UTC, datetime
-
     from maplab_py.algorithms.landmarks.evidence import with_evidence
     from maplab_py.algorithms.map_update.update import gather_all
 
-    try:
-        at_s = datetime.fromisoformat(date).replace(tzinfo=UTC).timestamp() if date else None
-    except ValueError:
-        raise UserError(f"--date={date} is not a date: write it as 2027-01-31") from None
+    at_s = _seconds(date) if date else None
     vi_map = with_evidence(context.vi_map, None) if forget else context.vi_map
     result, report = gather_all(vi_map, persistence, at_s=at_s, progress=context.progress)
     context.commit(result)
     return report
+
+
+@command("map_log", example="map_log", see_also=("update_map", "map_at"))
+def map_log(context: CommandContext) -> ChronicleReport:
+    """Show what each `update_map` added and removed, and the share of its session that is localised.
+
+    It is counted in the map before the update and in that after it, there without what the session saw itself.
+    """
+    from maplab_py.algorithms.map_update.chronicle import records
+
+    known = records(context.vi_map, context.map_folder)
+    stored_kb = round(sum(len(record.differences) for record in known) * 1e-3, 1)
+    return ChronicleReport(tuple(record.facts for record in known), stored_kb)
+
+
+@command("map_at", example="map_at --date=2020-01-31", see_also=("map_log", "undo"))
+def map_at(context: CommandContext, date: str) -> Message:
+    """Return to the map as it was at the end of a day, from the differences that updates stored.
+
+    `undo` brings the present map back.
+
+    Args:
+        date: The day, as 2027-01-31.
+    """
+    from maplab_py.algorithms.map_update.chronicle import map_before, records
+
+    end_s = _seconds(date) + 86_400.0
+    known = records(context.vi_map, context.map_folder)
+    if not known:
+        raise UserError("the map has no chronicle: update_map writes it")
+    result, dates = context.vi_map, [record.facts.date for record in known]
+    while known and _seconds(known[-1].facts.date) >= end_s:
+        result = map_before(result, known.pop())
+    if len(known) == len(dates):
+        return Message(f"the map is as it was on {date}: its last update is of {dates[-1]}")
+    context.commit(result)
+    return Message(f"the map is as it was before the update of {dates[len(known)]}")
+
+
+def _seconds(date: str) -> float:
+    from datetime import UTC, datetime
+
+    try:
+        return datetime.fromisoformat(date).replace(tzinfo=UTC).timestamp()
+    except (ValueError, OverflowError):
+        raise UserError(f"--date={date} is not a date: write it as 2027-01-31") from None

@@ -1,6 +1,7 @@
 """Options and reports of map updates."""
 
 import dataclasses
+from typing import Self
 
 from maplab_py.options import Options, option
 from maplab_py.report import Report
@@ -96,4 +97,39 @@ class MapUpdateReport(Report):
     missions_without_imu: int  # thinned: their poses are joined by odometry edges
     megabytes_before: float
     megabytes_after: float
+    localized_before: float  # share of the sessions' vertices, in the map before
+    localized_after: float  # and in the map after, without what they saw themselves
     notes: tuple[str, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class UpdateRecord:
+    """One update in the chronicle of a map."""
+
+    date: str  # begin of the session
+    session: str  # beginning of the mission's id
+    vertices_added: int
+    vertices_removed: int
+    landmarks_added: int
+    landmarks_vanished: int
+    landmarks_thinned: int
+    megabytes_before: float
+    megabytes_after: float
+    localized_before: float
+    localized_after: float
+
+    @classmethod
+    def of(cls, report: MapUpdateReport) -> Self:
+        """Return the record of an update."""
+        newest = max(report.sessions, key=lambda line: line.date)
+        names = [field.name for field in dataclasses.fields(cls)[2:]]
+        values = {name: round(getattr(report, name), 4) for name in names}
+        return cls(date=newest.date, session=newest.session, **values)
+
+
+@dataclasses.dataclass(frozen=True)
+class ChronicleReport(Report):
+    """Updates of a map, the oldest first."""
+
+    updates: tuple[UpdateRecord, ...]
+    stored_kb: float  # of the differences that lead back

@@ -35,6 +35,7 @@ class Placed:
     T_G_M: F64  # (N, 7)
     keypoint: I64  # (O,)
     landmark: I64  # (O,) rows of the map
+    localized: float  # share of the vertices
 
 
 def place(vi_map: VIMap, session: VIMap, progress: Progress = SILENT) -> Placed:
@@ -75,7 +76,10 @@ def place(vi_map: VIMap, session: VIMap, progress: Progress = SILENT) -> Placed:
     columns = zip(*(m for m, k in zip(matches, kept, strict=True) if k), strict=True)
     joined = [np.concatenate([empty, *column]) for column in columns] or [empty, empty]
     return Placed(
-        np.array(missions, dtype=np.int64), np.array(aligned).reshape(-1, 7), joined[0], joined[1]
+        np.array(missions, dtype=np.int64),
+        np.array(aligned).reshape(-1, 7),
+        *joined,
+        len(rows) / max(len(source.vertex), 1),
     )
 
 

@@ -24,10 +24,14 @@ from maplab_py.algorithms.landmarks.persistence import (
 from maplab_py.algorithms.landmarks.quality import evaluate_quality
 from maplab_py.algorithms.landmarks.tracks import init_tracks
 from maplab_py.algorithms.landmarks.triangulation import retriangulate
+from maplab_py.algorithms.localization.database import database_of_map
+from maplab_py.algorithms.localization.localization import localize_missions
+from maplab_py.algorithms.localization.options import LocalizationOptions
 from maplab_py.algorithms.loop_closure.features import ProjectionMemory, SearchScope
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.workflow import close_loops
 from maplab_py.algorithms.map_update.changes import find_changes
+from maplab_py.algorithms.map_update.chronicle import on_newest_mission, stored_order, with_record
 from maplab_py.algorithms.map_update.options import (
     ChangeReport,
     EvidenceReport,
@@ -118,7 +122,8 @@ def update_map(
         session = with_new_ids(session, content_rng(vi_map, "update", session))
     check_disjoint(vi_map, session)
     prepared = prepare_session(session, keyframing, progress=progress)
-    whole, merged = merge_session(vi_map, prepared, loops, progress=progress)
+    whole, merged, localized = merge_session(vi_map, prepared, loops, progress=progress)
+    whole = on_newest_mission(whole)
     lines = []
     new_ids = prepared.missions.id
     for mission in whole.mission_index.rows(new_ids).tolist():
@@ -127,7 +132,8 @@ def update_map(
     is_new = np.zeros(len(whole.missions), dtype=np.bool_)
     is_new[whole.mission_index.rows(new_ids)] = True
     result, thinned = thin(whole, is_new, options, persistence, progress)
-    return result, MapUpdateReport(
+    result = stored_order(result)
+    report = MapUpdateReport(
         sessions=tuple(lines),
         vertices_before=len(vi_map.vertices),
         vertices_added=len(prepared.vertices),
@@ -143,12 +149,26 @@ def update_map(
         missions_without_imu=thinned.missions_without_imu,
         megabytes_before=size_mb(vi_map),
         megabytes_after=size_mb(result),
+        localized_before=localized,
+        localized_after=_localized(result, prepared, progress),
         notes=tuple(
             f"session {line.session} tells nothing: it should have seen no landmark of an earlier one"
             for line in lines
             if line.predicted == 0
         ),
     )
+    return with_record(vi_map, result, report), report
+
+
+def _localized(vi_map: VIMap, session: VIMap, progress: Progress) -> float:
+    """Return the share of a session's vertices that are localised in the other missions of a map."""
+    known = vi_map.baseframes.is_known[vi_map.missions.baseframe]
+    known[vi_map.mission_index.rows(session.missions.id)] = False
+    if not known.any():
+        return 0.0
+    database = database_of_map(vi_map, missions=np.flatnonzero(known))
+    localized = localize_missions(database, session, LocalizationOptions(), progress=progress)
+    return float(localized.is_localized.mean())
 
 
 def merge_session(
@@ -157,12 +177,15 @@ def merge_session(
     loops: LoopClosureOptions = _LOOPS,
     *,
     progress: Progress = SILENT,
-) -> tuple[VIMap, int]:
-    """Return the map with a prepared session anchored, merged and optimised, and the landmarks merged.
+) -> tuple[VIMap, int, float]:
+    """Return the map with a prepared session anchored, merged and optimised.
 
     Raises:
         MapError: The session does not fit the map, or is in it already.
         EstimationError: The session cannot be anchored in the map, or not be optimised.
+
+    Returns:
+        The map, the landmarks merged, and the share of the session's vertices that were localised.
     """
     placed = place(vi_map, session, progress)
     whole, _ = merge_maps(vi_map, _at_place(session, placed))
@@ -182,7 +205,8 @@ def merge_session(
     whole = _optimized(whole, ids, progress)
     quality = LandmarkQualityOptions(min_observers=_MIN_OBSERVERS)
     rows = whole.mission_index.rows(ids)
-    return evaluate_quality(whole, quality, missions=rows, progress=progress)[0], merged
+    whole, _ = evaluate_quality(whole, quality, missions=rows, progress=progress)
+    return whole, merged, placed.localized
 
 
 def changes_since(vi_map: VIMap, session: VIMap, *, progress: Progress = SILENT) -> ChangeReport:
@@ -202,7 +226,7 @@ def changes_since(vi_map: VIMap, session: VIMap, *, progress: Progress = SILENT)
     # the result is a report: ids do not matter, and parts of a recording have equal ones
     session = with_new_ids(session, content_rng(vi_map, "changes", session))
     prepared = prepare_session(session, progress=progress)
-    whole, _ = merge_session(vi_map, prepared, progress=progress)
+    whole, *_ = merge_session(vi_map, prepared, progress=progress)
     later = np.zeros(len(whole.missions), dtype=np.bool_)
     later[whole.mission_index.rows(prepared.missions.id)] = True
     return find_changes(whole, later, progress)

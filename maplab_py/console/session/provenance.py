@@ -63,10 +63,10 @@ class Provenance:
 
         copies = [entry.disk_copy for entry in result.entries.values() if entry.disk_copy]
         known = {copy.folder: copy.fingerprint for copy in copies}
-        read_paths, written_paths = _paths_of(call)
+        read_paths, written_paths = _paths_of(call, base)
         inputs = tuple(input_of(path, known.get(path.resolve(), "")) for path in read_paths)
         outputs = tuple(str(path.absolute()) for path in written_paths)
-        text, number = _text(call), next(self._numbers)
+        text, number = _text(call, base), next(self._numbers)
         line = ScriptLine(number, text, before, result.selected, inputs, outputs)
         named = {value for value in call.values.values() if isinstance(value, str)}
         removed = base.entries.keys() - result.entries.keys()
@@ -98,7 +98,7 @@ class Provenance:
     ) -> list[str]:
         """Write the cards of the maps that a command has saved; return why some cannot be written."""
         problems = []
-        read, written = ({path.resolve() for path in paths} for paths in _paths_of(call))
+        read, written = ({path.resolve() for path in paths} for paths in _paths_of(call, base))
         known = {id(entry.disk_copy) for entry in base.entries.values()}
         for entry in result.entries.values():
             copy, script = entry.disk_copy, self.script_of(entry)
@@ -130,19 +130,32 @@ def script_text(script: Script) -> list[str]:
     return lines
 
 
-def _paths_of(call: Call) -> tuple[list[Path], list[Path]]:
+def _paths_of(call: Call, base: MapsState) -> tuple[list[Path], list[Path]]:
     """Return the paths that a call reads, and those that it writes."""
     reads = call.command.reads
-    paths = {name: path for name, path in call.values.items() if isinstance(path, Path)}
+    values = _values(call, base)
+    paths = {name: path for name, path in values.items() if isinstance(path, Path)}
     written = [path for name, path in paths.items() if name not in reads]
     return [paths[name] for name in reads if name in paths], written
 
 
-def _text(call: Call) -> str:
+def _values(call: Call, base: MapsState) -> dict[str, Any]:
+    """Return the values of a call; names of folders that are no keys of maps are paths."""
+    values = dict(call.values)
+    for name in call.command.reads:
+        value = values.get(name)
+        if isinstance(value, str) and value not in base.entries and Path(value).is_dir():
+            values[name] = Path(value)
+    return values
+
+
+def _text(call: Call, base: MapsState) -> str:
     """Write a call as a line, with the lasting flags that it used."""
     flags = call.command.flags
     given: Mapping[str, Any] = {
-        name: value for name, value in call.values.items() if value != flags[name].default
+        name: value
+        for name, value in _values(call, base).items()
+        if value != flags[name].default
     }
     words: Iterable[str] = (f"--{name}={_quote(value)}" for name, value in sorted(given.items()))
     return " ".join([call.command.name, *words, *map(_quote, call.words)])
