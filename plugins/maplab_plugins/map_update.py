@@ -90,7 +90,7 @@ def gather_evidence(
 def map_log(context: CommandContext) -> ChronicleReport:
     """Show what each `update_map` added and removed, and the share of its session that is localised.
 
-    It is counted in the map before the update and in that after it, there without what the session saw itself.
+    It is counted in the map before the update, and in that after it without what the session saw itself.
     """
     from maplab_py.algorithms.map_update.chronicle import records
 

@@ -153,9 +153,7 @@ def _text(call: Call, base: MapsState) -> str:
     """Write a call as a line, with the lasting flags that it used."""
     flags = call.command.flags
     given: Mapping[str, Any] = {
-        name: value
-        for name, value in _values(call, base).items()
-        if value != flags[name].default
+        name: value for name, value in _values(call, base).items() if value != flags[name].default
     }
     words: Iterable[str] = (f"--{name}={_quote(value)}" for name, value in sorted(given.items()))
     return " ".join([call.command.name, *words, *map(_quote, call.words)])

@@ -81,7 +81,9 @@ def test_states_before_other_commands_are_refused(folders: Path) -> None:
     session = Session()
     session.run("load", map_folder=folders / "two")
     session.run("reset_landmark_quality")
-    with pytest.raises(MapError, match="other commands changed the map after the update of 2020-11"):
+    with pytest.raises(
+        MapError, match="other commands changed the map after the update of 2020-11"
+    ):
         session.run("map_at", date="2020-10-20")
     assert len(session.run("map_log").updates) == 2
     session.run("load", map_folder=folders / "office")
