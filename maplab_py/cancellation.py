@@ -79,7 +79,7 @@ class CancelToken:
         try:
             yield
             self.has_effects = self.has_effects or not self._provisional
-            self._is_done = is_last
+            self._is_done = self._is_done or is_last
         finally:
             with self._lock:
                 self._depth -= 1

@@ -1,8 +1,11 @@
-"""Hooks of mkdocs: folders in the menu stand for their pages, and links to sources are for the repository."""
+"""Hooks of mkdocs: folders in the menu, titles of pages, and links to sources of the repository."""
 
+import logging
 import re
 from pathlib import Path
 from typing import Any
+
+logger = logging.getLogger("mkdocs.hooks.menu")  # warnings of mkdocs fail a strict build
 
 
 def on_config(config: Any) -> Any:
@@ -21,7 +24,7 @@ def on_config(config: Any) -> Any:
 def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
     """Turn links to files of the repository outside docs, which the site does not have, into code.
 
-    The search ranks decisions and studies below the users' pages.
+    The search ranks decisions and studies below the users' pages. A page without a title is warned of.
 
     Args:
         markdown: Text of a page.
@@ -32,6 +35,8 @@ def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
     """
     if page.file.src_uri.startswith(("decisions/", "studies/")):
         page.meta.setdefault("search", {"boost": 0.3})
+    if re.search(r"^# \S", markdown, re.MULTILINE) is None:
+        logger.warning("page '%s' has no title: begin it with '# Title'", page.file.src_uri)
     source = Path(page.file.abs_src_path)
     docs = Path(__file__).resolve().parents[1]
 

@@ -1,14 +1,24 @@
 """The visualisation commands, through the session."""
 
+import os
+import signal
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from maplab_plugins.visualization.following import Following
+from maplab_plugins.visualization.output import keep
 
+from maplab_py.cancellation import lasting_effect
 from maplab_py.console.session.session import Session
+from maplab_py.console.terminal.foreground import SECONDS_OF_GRACE, run_in_foreground
+from maplab_py.console.terminal.protocol import SilentTerminal
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
 from maplab_py.interop.ply import PlyCloud, parse_ply, write_ply
@@ -88,6 +98,29 @@ def test_the_viewer_ends_with_the_session_and_by_command(session: Session) -> No
     assert second is not first
     session.watchers.close()
     assert second.is_stopped
+
+
+def test_ctrl_c_while_the_viewer_is_kept_loses_nothing_however_often() -> None:
+    kept = []
+
+    def press() -> None:
+        for _ in range(3):
+            time.sleep(0.02)
+            os.kill(os.getpid(), signal.SIGINT)
+
+    def work() -> str:
+        thread = threading.Thread(target=press)
+        thread.start()
+        viewer: Any = SimpleNamespace(url="", is_stopped=False)
+        keep(SimpleNamespace(terminal=SilentTerminal()), viewer)  # type: ignore[arg-type]
+        thread.join()
+        time.sleep(2.0 * SECONDS_OF_GRACE)  # a large map is written
+        with lasting_effect():
+            kept.append("map")
+        return "report"
+
+    assert run_in_foreground("rovioli", work) == "report"
+    assert kept == ["map"]
 
 
 def test_a_pick_is_a_variable_of_the_prompt(session: Session) -> None:

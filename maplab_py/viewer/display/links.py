@@ -16,7 +16,7 @@ import viser
 from maplab_py.array_types import F64
 from maplab_py.errors import UserError
 from maplab_py.viewer.display.parts import by_user
-from maplab_py.viewer.display.selection import Selection
+from maplab_py.viewer.display.selection import Selections
 from maplab_py.viewer.drawing import Drawing
 from maplab_py.viewer.picking import id_of
 
@@ -94,14 +94,12 @@ class View(Protocol):
     def visible_layers(self) -> set[str]:
         """Names of the layers that are drawn."""
 
-    @property
-    def selection(self) -> Selection:
-        """Picked entities."""
+    selections: Selections
 
     def set_layers(self, visible: set[str]) -> set[str]:
         """Show these layers and no others; return those that the map has not."""
 
-    def fly_to(self, text: str, clients: list[Any] | None = None) -> None:
+    def fly_to(self, text: str) -> None:
         """Select what an id means, and move the cameras of pages there; UserError if it means nothing."""
 
 
@@ -133,7 +131,7 @@ class Links:
             drawing = self._view.drawing
             camera = np.stack([client.camera.position, client.camera.look_at]) + drawing.origin_G
             layers = tuple(sorted(self._view.visible_layers))
-            picked = self._view.selection.picked
+            picked = self._view.selections.of(client).picked
             picked_id = "" if picked is None else id_of(drawing.vi_map, picked)
             text = link_text(SharedView(map_code(drawing), camera, layers, picked_id))
         except UserError as error:
@@ -147,7 +145,7 @@ class Links:
         try:
             with self._lock:
                 self._view.fly_to(id_)
-                drawing, picked = self._view.drawing, self._view.selection.picked
+                drawing, picked = self._view.drawing, self._view.selections.newest.picked
                 if self._server.get_clients() or picked is None:
                     return _TEXT.format(f"{id_[:8]} is selected in the open page of the viewer.")
                 distance_m = 0.25 * drawing.extent.radius_m
@@ -186,7 +184,7 @@ class Links:
             client.camera.look_at = target
         missing = self._view.set_layers(set(shared.layers))
         if shared.picked_id:
-            self._view.fly_to(shared.picked_id, [])
+            self._view.selections.jump(drawing, shared.picked_id, client)
         if missing:
             raise UserError(f"this map has no layer {', '.join(sorted(missing))[:200]}")
 

@@ -8,18 +8,14 @@ from functools import partial
 from html import escape
 from typing import Any, Protocol
 
-import numpy as np
 import viser
-from numpy.typing import NDArray
 
-from maplab_py.errors import UserError
 from maplab_py.viewer.colours import HIDDEN, from_hex
 from maplab_py.viewer.display.camera import VIEWS
 from maplab_py.viewer.display.parts import by_user
 from maplab_py.viewer.facts import Facts
 from maplab_py.viewer.layers.closures import REFUSED
 from maplab_py.viewer.options import COLOURINGS, VisualizationOptions
-from maplab_py.viewer.picking import MIN_DIGITS
 from maplab_py.viewer.scene import Layer, LegendEntry, MissionEntry, Scene
 
 MAX_SWITCHES = 24
@@ -30,7 +26,6 @@ MAX_LAYERS = 9
 
 _ALL = "all missions"
 _ANY = "any reason"
-_HINT = "Click a vertex, a landmark or a loop closure."
 
 
 class Actions(Protocol):
@@ -56,15 +51,6 @@ class Actions(Protocol):
 
     def look(self, client: Any, view: str) -> None:
         """Move the camera of one page."""
-
-    def set_measuring(self, is_measuring: bool) -> None:
-        """Measure between picks."""
-
-    def fly_to(self, text: str, clients: list[Any] | None = None) -> None:
-        """Select what an id means, and move the cameras of pages there; UserError if it means nothing."""
-
-    def clear_pick(self) -> None:
-        """Forget what was picked."""
 
 
 class Panel:
@@ -96,7 +82,7 @@ class Panel:
         self._bind(self.colouring, lambda _: self._choose_colouring())
         self._bind(self.coloured_mission, lambda _: self._choose_colouring())
         self._bind(self.refused, lambda event: self._choose_reason(event.target.value))
-        self._add_selection()
+        self.selection = self._gui.add_folder("Selection", order=4)
         self._add_view()
 
     def _bind(self, widget: Any, action: Callable[[Any], None]) -> None:
@@ -138,29 +124,6 @@ class Panel:
             self.coloured_mission.value = chosen
         if self.coloured_mission.visible != (len(missions) > 1):
             self.coloured_mission.visible = len(missions) > 1
-
-    def _add_selection(self) -> None:
-        with self._gui.add_folder("Selection", order=4):
-            self.image = self._gui.add_image(np.zeros((8, 8, 3), dtype=np.uint8), visible=False)
-            self.facts = self._gui.add_html(hint(_HINT))
-            self.jump: Any = self._gui.add_text(
-                "go to id", "", hint="beginning of the id of a vertex, landmark, closure or mission"
-            )
-            self.measuring: Any = self._gui.add_checkbox(
-                "measure", False, hint="measure the distance between two picks"
-            )
-            self.clear = self._gui.add_button("clear", visible=False)
-        self._bind(self.jump, self._jump)
-        self._bind(self.measuring, lambda event: self._actions.set_measuring(event.target.value))
-        self.clear.on_click(by_user(self._lock, lambda _: self._actions.clear_pick(), self.say))
-
-    def _jump(self, event: Any) -> None:
-        """Go where an id is as soon as it is long enough: the page sends every key."""
-        if len(event.target.value.strip()) >= MIN_DIGITS:
-            try:
-                self._actions.fly_to(event.target.value, [event.client])
-            except UserError as error:
-                self.show_hint(str(error))
 
     def _add_view(self) -> None:
         self.view = self._gui.add_folder("View", order=5, expand_by_default=False)
@@ -273,25 +236,6 @@ class Panel:
             press = partial(lambda m, b, _: toggle(m, b), mission, button)
             button.on_click(by_user(self._lock, press, self.say))
             self._mission_widgets.append(button)
-
-    def show_facts(self, facts: Facts, image: NDArray[np.uint8] | None, note: str = "") -> None:
-        """Show what was picked; without facts the hint, and the image that is there unless it was picked."""
-        table = fact_table(facts) if facts else hint(_HINT)
-        self.facts.content = (hint(note) if note else "") + table
-        if facts or self.clear.visible:
-            self.show_image(image)
-        self.clear.visible = bool(facts)
-
-    def show_hint(self, message: str) -> None:
-        """Say in the place of the facts why nothing was selected."""
-        self.facts.content = hint(message)
-
-    def show_image(self, image: NDArray[np.uint8] | None) -> None:
-        """Show the image (H, W, 3) of a vertex, or none."""
-        if image is not None:
-            self.image.image = image
-        if self.image.visible != (image is not None):
-            self.image.visible = image is not None
 
 
 def _switch_colour(mission: MissionEntry, *, is_shown: bool) -> tuple[int, int, int]:

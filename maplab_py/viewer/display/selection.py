@@ -1,8 +1,9 @@
-"""Selected entities: their facts, frusta and rays, and the distance between two picks."""
+"""Selected entities of each page: their facts, frusta and rays, and the distance between two picks."""
 
 from __future__ import annotations
 
 import dataclasses
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -14,91 +15,140 @@ from numpy.typing import NDArray
 from maplab_py.algorithms.landmarks.sightings import residuals
 from maplab_py.algorithms.loop_closure.closure_record import read_record
 from maplab_py.array_types import F64, I64, U8
-from maplab_py.errors import MapError
+from maplab_py.errors import MapError, UserError
 from maplab_py.viewer import colours
+from maplab_py.viewer.display import panel
 from maplab_py.viewer.display.camera import approach
-from maplab_py.viewer.display.panel import Panel
-from maplab_py.viewer.display.parts import add_part
+from maplab_py.viewer.display.parts import add_part, by_user
 from maplab_py.viewer.drawing import Drawing, make_points, make_segments
-from maplab_py.viewer.facts import facts
+from maplab_py.viewer.facts import Facts, facts
 from maplab_py.viewer.layers import cameras
 from maplab_py.viewer.layers.closures import closure_ends
-from maplab_py.viewer.picking import Pick, find_by_id, id_of
+from maplab_py.viewer.picking import MIN_DIGITS, Pick, find_by_id, id_of
 from maplab_py.viewer.resource_clouds import VertexImages
 from maplab_py.viewer.scene import Entity, Part
 from maplab_py.vimap import VIMap, ragged_rows
 from maplab_py.vimap.descriptors import binary_descriptor_sizes
 
+_HINT = "Click a vertex, a landmark or a loop closure."
 _MAX_FRUSTA = 16
 """More cameras of one landmark's observers would hide it."""
 
 
-class Selection:
-    """The picked thing and its marks in the scene."""
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Content:
+    """Facts and image of a selected entity."""
 
-    def __init__(self, server: viser.ViserServer, panel: Panel) -> None:
+    facts: Facts
+    image: U8 | None  # of a vertex, or both images of a closure
+    note: str
+    ends: tuple[int, ...]  # vertices (rows) of a closure
+
+
+def _content(drawing: Drawing, picked: Pick) -> _Content:
+    vi_map, images, ends = drawing.vi_map, drawing.images, _closure_ends(drawing, picked)
+    image, note = None, ""
+    if picked.entity is Entity.VERTEX:
+        image = images(picked.row)
+        if image is not None and isinstance(images, VertexImages):
+            image, note = with_keypoints(vi_map, image, images.frame(picked.row))
+    elif ends and isinstance(images, VertexImages):
+        image, note = closure_picture(vi_map, images, *ends) or (None, "")
+    return _Content(facts(vi_map, picked.entity, picked.row), image, note, ends)
+
+
+def _closure_ends(drawing: Drawing, picked: Pick) -> tuple[int, ...]:
+    if picked.entity is Entity.LOOP_CLOSURE:
+        edges = drawing.vi_map.loop_closure_edges
+        return int(edges.from_vertex[picked.row]), int(edges.to_vertex[picked.row])
+    if picked.entity is Entity.CLOSURE:
+        closure = read_record(drawing.vi_map).closures.take(np.array([picked.row]))
+        return tuple(np.concatenate(closure_ends(drawing, closure)).tolist())
+    return ()
+
+
+class _Widgets:
+    """Folder "Selection" as one page has it."""
+
+    def __init__(self, page: Any, folder: Any) -> None:
+        with folder:
+            self.image = page.gui.add_image(np.zeros((8, 8, 3), dtype=np.uint8), visible=False)
+            self.facts = page.gui.add_html(panel.hint(_HINT))
+            self.jump = page.gui.add_text(
+                "go to id", "", hint="beginning of the id of a vertex, landmark, closure or mission"
+            )
+            self.measuring = page.gui.add_checkbox(
+                "measure", False, hint="measure the distance between two picks"
+            )
+            self.clear = page.gui.add_button("clear", visible=False)
+
+    def show(self, shown: Facts, image: U8 | None, note: str) -> None:
+        """Show facts; without any the hint, and the image that is there unless it is of a pick."""
+        table = panel.fact_table(shown) if shown else panel.hint(_HINT)
+        self.facts.content = (panel.hint(note) if note else "") + table
+        if shown or self.clear.visible:
+            self.show_image(image)
+        self.clear.visible = bool(shown)
+
+    def show_image(self, image: U8 | None) -> None:
+        """Show an image (H, W, 3), or none."""
+        if image is not None:
+            self.image.image = image
+        if self.image.visible != (image is not None):
+            self.image.visible = image is not None
+
+
+class Selection:
+    """Selected entity of a page, and its marks in the scene; without a page, that of pages to come."""
+
+    def __init__(self, page: Any = None, widgets: _Widgets | None = None) -> None:
         """Start with nothing picked."""
-        self._server = server
-        self._panel = panel
+        self._page = page
+        self._widgets = widgets
         self._handles: list[Any] = []
         self._anchor: Pick | None = None  # the first of two picks to measure between
-        self._ends: tuple[int, ...] = ()  # vertices (rows) of the picked closure
         self.is_measuring = False
         self.picked: Pick | None = None
         self.distance_m: float | None = None
         self.picture: U8 | None = None  # of the pick: an image, or both images of a closure
-        self.on_pick: Callable[[str], None] = lambda _: None  # told the id of each pick
 
-    def pick(self, drawing: Drawing, picked: Pick) -> None:
-        """Mark what was clicked and show its facts."""
+    def show(self, drawing: Drawing, picked: Pick, content: _Content) -> None:
+        """Mark what was picked and show its facts."""
         previous, self.picked, self.distance_m = self.picked, picked, None
-        self.on_pick(id_of(drawing.vi_map, picked))
         self._clear_marks()
-        self._ends = ()
-        note = ""
+        self.picture, note = content.image, content.note
         if self.is_measuring and previous is not None:
             self._anchor = previous
             self.distance_m = float(np.linalg.norm(picked.p - previous.p))
             note = f"distance to the pick before: {self.distance_m:.3f} m"
-        self._mark(drawing, picked)
-        image = None
-        if picked.entity is Entity.VERTEX:
-            image = drawing.images(picked.row)
-            if image is not None and isinstance(drawing.images, VertexImages):
-                image, words = with_keypoints(
-                    drawing.vi_map, image, drawing.images.frame(picked.row)
-                )
-                note = note or words
-        elif self._ends and isinstance(drawing.images, VertexImages):
-            pair = closure_picture(drawing.vi_map, drawing.images, *self._ends)
-            image, note = pair or (None, note)
-        self.picture = image
-        self._panel.show_facts(facts(drawing.vi_map, picked.entity, picked.row), image, note)
-
-    def jump(self, drawing: Drawing, text: str, clients: list[Any]) -> None:
-        """Pick what an id means, and move the cameras of pages there.
-
-        Raises:
-            UserError: Nothing has an id that starts so, or several have.
-        """
-        picked = find_by_id(drawing, text)
-        self.pick(drawing, picked)
-        for client in clients:
-            with client.atomic():
-                approach(client.camera, picked.p, 0.25 * drawing.extent.radius_m)
+        if self._page is not None:
+            self._mark(drawing, picked, content.ends)
+        if self._widgets is not None:
+            self._widgets.show(content.facts, content.image, note)
 
     def clear(self) -> None:
         """Clear the pick."""
         self._clear_marks()
         self.picked = self._anchor = self.distance_m = None
-        self._panel.show_facts((), None)
+        if self._widgets is not None:
+            self._widgets.show((), None, "")
+
+    def show_image(self, image: U8) -> None:
+        """Show an image (H, W, 3) that is not of the pick."""
+        if self._widgets is not None:
+            self._widgets.show_image(image)
+
+    def say(self, message: str) -> None:
+        """Say in the place of the facts why nothing was selected."""
+        if self._widgets is not None:
+            self._widgets.facts.content = panel.hint(message)
 
     def _clear_marks(self) -> None:
         for handle in self._handles:
             handle.remove()
         self._handles = []
 
-    def _mark(self, drawing: Drawing, picked: Pick) -> None:
+    def _mark(self, drawing: Drawing, picked: Pick, ends: tuple[int, ...]) -> None:
         size = 0.005 * drawing.unit_m
         row = np.array([picked.row])
         self._add("point", make_points(picked.p[None], colours.PICKED, row, size))
@@ -110,21 +160,13 @@ class Selection:
             observers = np.unique(vertices)
             every = -(-len(observers) // _MAX_FRUSTA)
             self._add_frusta(drawing, observers[::every], 0.015, 1.0)
-        elif picked.entity is Entity.LOOP_CLOSURE:
-            edges = drawing.vi_map.loop_closure_edges
-            ends = np.array([edges.from_vertex[picked.row], edges.to_vertex[picked.row]])
-            self._mark_closure(drawing, ends.astype(np.int64))
-        elif picked.entity is Entity.CLOSURE:
-            record = read_record(drawing.vi_map).closures.take(row)
-            self._mark_closure(drawing, np.concatenate(closure_ends(drawing, record)))
+        elif ends:
+            rows = np.array(ends)
+            p = drawing.p_vertices[rows]
+            self._add("edge", make_segments(p[:1], p[1:], colours.PICKED, rows[:1], 6.0))
+            self._add_frusta(drawing, rows, 0.05, 2.0)
         if self.distance_m is not None and self._anchor is not None:
             self._mark_distance(picked, self._anchor, self.distance_m, size)
-
-    def _mark_closure(self, drawing: Drawing, ends: NDArray[np.int64]) -> None:
-        self._ends = tuple(ends.tolist())
-        p = drawing.p_vertices[ends]
-        self._add("edge", make_segments(p[:1], p[1:], colours.PICKED, ends[:1], 6.0))
-        self._add_frusta(drawing, ends, 0.05, 2.0)
 
     def _mark_vertex(self, drawing: Drawing, row: int) -> None:
         vi_map = drawing.vi_map
@@ -161,13 +203,143 @@ class Selection:
         line = make_segments(anchor.p[None], picked.p[None], colours.SECOND_PICK, row, 3.0)
         self._add("distance", line)
         middle = 0.5 * (anchor.p + picked.p)
-        label = self._server.scene.add_label(
+        label = self._page.scene.add_label(
             "/pick/distance_label", f"{distance_m:.3f} m", position=middle
         )
         self._handles.append(label)
 
     def _add(self, name: str, part: Part) -> None:
-        self._handles += add_part(self._server, f"/pick/{name}", part)
+        self._handles += add_part(self._page, f"/pick/{name}", part)
+
+
+class Selections:
+    """Selections of all pages.
+
+    A page selects for itself, the console for all pages and for those that will be opened.
+
+    Attributes:
+        newest: Selection that was changed last.
+        pages: Selections of open pages by their number.
+        on_pick: Told the id of each pick.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        folder: Any,
+        drawing: Callable[[], Drawing],
+        lock: threading.RLock,
+        say: Callable[[str], None],
+    ) -> None:
+        """Give every page its widgets in a folder of the panel.
+
+        Args:
+            server: Where.
+            folder: Folder.
+            drawing: Returns the map as it is drawn.
+            lock: Held while a page is served.
+            say: Shows a message.
+        """
+        self._server, self._folder, self._drawing = server, folder, drawing
+        self._lock, self._say = lock, say
+        self._general = Selection()
+        self.pages: dict[int, Selection] = {}
+        self._live: U8 | None = None
+        self.newest = self._general
+        self.on_pick: Callable[[str], None] = lambda _: None
+        server.on_client_connect(self._open)
+        server.on_client_disconnect(self._close)
+
+    def of(self, page: Any) -> Selection:
+        """Return the selection of a page, which begins as the console's."""
+        key = getattr(page, "client_id", None)
+        if key is None:
+            return self._general
+        if key not in self.pages:
+            self.pages[key] = selection = Selection(page, self._make_widgets(page))
+            selection.is_measuring, picked = self._general.is_measuring, self._general.picked
+            if picked is not None:
+                selection.show(self._drawing(), picked, _content(self._drawing(), picked))
+            elif self._live is not None:
+                selection.show_image(self._live)
+        return self.pages[key]
+
+    def pick(self, drawing: Drawing, picked: Pick, page: Any = None) -> None:
+        """Select in a page, None = in all."""
+        content = _content(drawing, picked)
+        selections = self._general, *self.pages.values()
+        for selection in selections if page is None else (self.of(page),):
+            selection.show(drawing, picked, content)
+        self.newest = self._general if page is None else self.of(page)
+        self.on_pick(id_of(drawing.vi_map, picked))
+
+    def jump(self, drawing: Drawing, text: str, page: Any = None) -> Pick:
+        """Select what an id means in a page, None = in all.
+
+        Raises:
+            UserError: Nothing has an id that starts so, or several have.
+        """
+        picked = find_by_id(drawing, text)
+        self.pick(drawing, picked, page)
+        return picked
+
+    def clear(self) -> None:
+        """Clear the picks of all pages."""
+        for selection in (self._general, *self.pages.values()):
+            selection.clear()
+        self.newest = self._general
+
+    def set_measuring(self, is_measuring: bool) -> None:
+        """Measure between the picks of each page, or not."""
+        for selection in (self._general, *self.pages.values()):
+            selection.is_measuring = is_measuring
+
+    def show_image(self, image: U8) -> None:
+        """Show an image (H, W, 3) in all pages, as of a recording that runs."""
+        with self._lock:
+            self._live = image
+            for selection in self.pages.values():
+                selection.show_image(image)
+
+    def _open(self, page: Any) -> None:
+        with self._lock:
+            if page.client_id in self._server.get_clients():  # else it has left already
+                self.of(page)
+
+    def _close(self, page: Any) -> None:
+        with self._lock:
+            self.pages.pop(page.client_id, None)
+
+    def _make_widgets(self, page: Any) -> _Widgets:
+        widgets = _Widgets(page, self._folder)
+
+        def measure(event: Any) -> None:
+            self.of(page).is_measuring = event.target.value
+
+        for widget, action in ((widgets.jump, self._go), (widgets.measuring, measure)):
+            widget.on_update(by_user(self._lock, action, self._say))
+        clear = by_user(self._lock, lambda _: self.of(page).clear(), self._say)
+        widgets.clear.on_click(clear)
+        return widgets
+
+    def _go(self, event: Any) -> None:
+        """Go where an id is as soon as it is long enough: the page sends every key."""
+        text, selection = event.target.value, self.of(event.client)
+        if len(text.strip()) < MIN_DIGITS:
+            return
+        drawing = self._drawing()
+        try:
+            picked = self.jump(drawing, text, event.client)
+        except UserError as error:
+            selection.say(str(error))
+        else:
+            fly(event.client, drawing, picked)
+
+
+def fly(page: Any, drawing: Drawing, picked: Pick) -> None:
+    """Move the camera of a page to what was picked."""
+    with page.atomic():
+        approach(page.camera, picked.p, 0.25 * drawing.extent.radius_m)
 
 
 _LARGE_ERROR_PX = 3.0

@@ -22,7 +22,8 @@ import websockets.asyncio.server
 from maplab_py.errors import UserError
 
 LOOPBACK = "127.0.0.1"
-_LOCAL_ORIGINS = (None, re.compile(r"https?://(localhost|127\.0\.0\.1|\[::1\])(:\d+)?"))
+_LOCAL_HOST = r"(localhost|127\.0\.0\.1|\[::1\])(:\d+)?"
+_LOCAL_ORIGINS = (None, re.compile(f"https?://{_LOCAL_HOST}"))
 """Origins that may open a connection: pages of this viewer on any forwarded port, and programs."""
 
 _GO = re.compile(r"/go/([0-9a-f]{1,32})")
@@ -143,7 +144,9 @@ def with_links_to_ids(process_request: Any, go: Callable[[str], str]) -> Any:
         match = _GO.fullmatch(request.path)
         if match is None:
             return process_request(connection, request)
-        if request.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
+        host = request.headers.get("Host", "")  # of another site whose name leads here
+        is_foreign = request.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin")
+        if is_foreign or re.fullmatch(_LOCAL_HOST, host, re.IGNORECASE) is None:
             return connection.respond(http.HTTPStatus.FORBIDDEN, "")
         return answer(connection, match[1])
 

@@ -31,7 +31,7 @@ from maplab_py.viewer.display.picture import (
 )
 from maplab_py.viewer.display.playback_control import Playback
 from maplab_py.viewer.display.player import Player
-from maplab_py.viewer.display.selection import Selection
+from maplab_py.viewer.display.selection import Selection, Selections, fly
 from maplab_py.viewer.display.server import LOOPBACK, start_server
 from maplab_py.viewer.display.themes import Themes
 from maplab_py.viewer.display.time_machine import TimeMachine
@@ -56,7 +56,8 @@ class Viewer:
     Attributes:
         scene: What is shown.
         subject: What it was made of.
-        show_image: Shows an image (H, W, 3) in the panel, or none.
+        selections: What each page has selected.
+        show_image: Shows an image (H, W, 3) in the panel.
         court: Where closures are judged.
         links: Makes and opens links to a view.
     """
@@ -76,8 +77,10 @@ class Viewer:
         self._cameras = Cameras(self._server)
         self._nodes = Nodes(self._server)
         self._panel = Panel(self._server, self, self._lock)
-        self.show_image = self._panel.show_image
-        self._selection = Selection(self._server, self._panel)
+        self.selections = Selections(
+            self._server, self._panel.selection, lambda: self.drawing, self._lock, self._panel.say
+        )
+        self.show_image = self.selections.show_image
         self._choices: dict[str, bool] = {}  # layers that the user has switched
         self._hidden: set[str] = set()  # ids of missions that the user has hidden
         self._playback = Playback(self._server, self, self._lock, self._panel.say)
@@ -287,8 +290,8 @@ class Viewer:
 
     @property
     def selection(self) -> Selection:
-        """Picked entities."""
-        return self._selection
+        """Selection that was changed last."""
+        return self.selections.newest
 
     def set_layer(self, name: str, is_visible: bool) -> None:
         """Show or hide a layer."""
@@ -391,27 +394,28 @@ class Viewer:
     # -- picking ----------------------------------------------------------------------------------
 
     def set_measuring(self, is_measuring: bool) -> None:
-        """Measure between picks."""
-        self._selection.is_measuring = is_measuring
+        """Measure between the picks of each page."""
+        self.selections.set_measuring(is_measuring)
 
     def clear_pick(self) -> None:
-        """Forget what was picked."""
-        self._selection.clear()
+        """Forget what was picked in any page."""
+        self.selections.clear()
 
     def select(self, picked: Pick) -> None:
-        """Mark a thing and show its facts, as if it had been clicked."""
+        """Mark a thing and show its facts in all pages, as if it had been clicked in each."""
         with self._lock:
-            self._selection.pick(self.drawing, picked)
+            self.selections.pick(self.drawing, picked)
 
-    def fly_to(self, text: str, clients: list[Any] | None = None) -> None:
-        """Select what an id means, and move the cameras of pages there, None = of all.
+    def fly_to(self, text: str) -> None:
+        """Select what an id means in all pages, and move their cameras there.
 
         Raises:
             UserError: Nothing has an id that starts so, or several have.
         """
         with self._lock:
-            pages = list(self._server.get_clients().values()) if clients is None else clients
-            self._selection.jump(self.drawing, text, pages)
+            picked = self.selections.jump(self.drawing, text)
+            for page in self._server.get_clients().values():
+                fly(page, self.drawing, picked)
 
     def _go(self, id_: str) -> str:
         return self.links.go(id_)
@@ -424,7 +428,7 @@ class Viewer:
             layers=self.visible_layers, missions=self.visible_missions,
         )  # fmt: skip
         if picked is not None:
-            self.select(picked)
+            self.selections.pick(self.drawing, picked, event.client)
 
     # -- drawing ----------------------------------------------------------------------------------
 
@@ -468,7 +472,7 @@ class Viewer:
         is_other_map = self.scene is None or self.scene.title != scene.title
         self.subject, self.scene, self._drawing = subject, scene, drawing
         if is_new_map:
-            self._selection.clear()
+            self.selections.clear()
         self._playback.stop()
         if is_new_place:
             self._nodes.show_ground(make_ground(scene.extent, scene.origin_G))

@@ -203,7 +203,7 @@ def ensure_viewer(context: CommandContext, options: ViewerOptions) -> Viewer:
     viewer = Viewer(options.port, is_dark=options.dark)
     try:
         with lasting_effect():
-            viewer.selection.on_pick = partial(context.session.variables.__setitem__, "pick")
+            viewer.selections.on_pick = partial(context.session.variables.__setitem__, "pick")
             context.session.watchers.set(NAME, Following(viewer))
             context.announce(NAME, viewer.url)
     except Cancelled:

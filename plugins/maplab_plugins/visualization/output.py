@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from maplab_plugins.visualization.following import NAME, running_viewer, viewer_for_output
-from maplab_py.cancellation import check_cancelled, ending_early
+from maplab_py.cancellation import current_token, lasting_effect
 from maplab_py.plugin import CommandContext, Message, Report, UserError, command
 
 if TYPE_CHECKING:
@@ -148,15 +148,18 @@ def viewer_keep(context: CommandContext, *, duration_s: float = 0.0) -> Message:
 
 
 def keep(context: CommandContext, viewer: Viewer, duration_s: float = 0.0) -> None:
-    """Wait until Ctrl-C, until the viewer stops, or for a time [s] that is not zero."""
-    start = time.monotonic()
+    """Wait until Ctrl-C, until the viewer stops, or for a time [s] that is not zero.
+
+    What the command has made stays, however often Ctrl-C is pressed.
+    """
+    start, token = time.monotonic(), current_token()
     context.terminal.note(f"{viewer.url} until Ctrl-C")
-    with ending_early() as is_to_end:
-        while not (is_to_end() or viewer.is_stopped):
+    with lasting_effect(is_last=True):
+        while not (token.cancelled or viewer.is_stopped):
             if 0.0 < duration_s <= time.monotonic() - start:
                 break
-            check_cancelled()
             time.sleep(0.1)
+    token.cancelled = False
 
 
 def _check_target(file: Path, *, overwrite: bool) -> None:

@@ -157,8 +157,8 @@ def test_a_link_before_the_map_is_told() -> None:
     viewer.stop()
 
 
-def _open(address: str, site: str = "none") -> tuple[int, str]:
-    request = urllib.request.Request(address, headers={"Sec-Fetch-Site": site})
+def _open(address: str, **headers: str) -> tuple[int, str]:
+    request = urllib.request.Request(address, headers=headers)
     try:
         with urllib.request.urlopen(request, timeout=20.0) as answer:
             return answer.status, answer.read().decode()
@@ -179,7 +179,8 @@ def test_an_address_of_an_id_selects_it(viewer: Viewer) -> None:
     assert shared.picked_id == id_
     np.testing.assert_allclose(shared.camera_G[1], MAP.p_G[3], atol=1e-3)
     viewer.clear_pick()
-    assert _open(f"{viewer.url}/go/{id_}", "cross-site")[0] == 403
+    for headers in ({"Sec-Fetch-Site": "cross-site"}, {"Host": f"evil.example:{viewer.port}"}):
+        assert _open(f"{viewer.url}/go/{id_}", **headers)[0] == 403
     assert viewer.selection.picked is None
     assert "has an id that starts" in _open(f"{viewer.url}/go/{32 * 'f'}")[1]
     assert _open(f"{viewer.url}/go/../x")[0] != 403

@@ -25,6 +25,7 @@ from maplab_py.sensors import SensorSet
 from maplab_py.viewer.building import Subject, make_checked_drawing
 from maplab_py.viewer.display.camera import BEHIND, INSIDE, ride
 from maplab_py.viewer.display.parts import add_part, by_user
+from maplab_py.viewer.display.selection import fly
 from maplab_py.viewer.display.server import page_script
 from maplab_py.viewer.display.viewer import Viewer
 from maplab_py.viewer.layers.clouds import Cloud
@@ -206,9 +207,9 @@ def test_layers_and_missions_can_be_hidden(viewer: Viewer, two_missions: VIMap) 
 def test_an_id_selects_what_it_names(viewer: Viewer, two_missions: VIMap) -> None:
     camera = SimpleNamespace(position=np.array([0.0, -8.0, 6.0]), look_at=np.zeros(3))
     page = SimpleNamespace(camera=camera, atomic=threading.Lock)
-    viewer.fly_to(to_hex(two_missions.landmarks.id[4]), [page])
-    picked = viewer.selection.picked
-    assert picked is not None
+    picked = viewer.selections.jump(viewer.drawing, to_hex(two_missions.landmarks.id[4]))
+    fly(page, viewer.drawing, picked)
+    assert viewer.selection.picked is picked
     assert picked.row == 4
     np.testing.assert_allclose(camera.look_at, two_missions.p_G[4])
     back = camera.position - camera.look_at
