@@ -124,10 +124,8 @@ def map_health(
     """Judge a map.
 
     Args:
-        vi_map: The map.
         map_key: Its name, for the report.
         folder: Where it is on disk, for the space that it takes; None = it is not saved.
-        progress: Told of the progress.
     """
     findings = list(_consistency(vi_map))
     if findings[0].verdict is not Verdict.HOPELESS:

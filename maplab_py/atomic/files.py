@@ -145,7 +145,6 @@ def replaced_file(path: Path, *, durable: bool = True) -> Iterator[BinaryIO]:
     permissions. After an exception, or if the running command has been cancelled, nothing has changed.
 
     Args:
-        path: The file.
         durable: Flush to disk, so that the content survives a power failure. Not needed for
             files that can be recreated, which do not count as an effect of a command either.
 

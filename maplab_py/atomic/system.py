@@ -41,7 +41,6 @@ def flush_tree(folder: Path, on_disk: Collection[Path] = ()) -> None:
     """Flush all files and folders below a folder, and the folder itself, to disk.
 
     Args:
-        folder: The folder.
         on_disk: Files that are left out, as their content is on disk.
     """
     for path in sorted(folder.rglob("*")):

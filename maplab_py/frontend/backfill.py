@@ -52,7 +52,6 @@ class WaitingFrames:
 
         Args:
             stamp_ns: Of its images.
-            frame: The frame.
             before: Samples (S,), (S, 6) up to it, if it is the first.
         """
         if not self.frames or len(frame.imu_times_ns) < 3:
@@ -223,7 +222,6 @@ class Backfiller:
         """Read backwards from a start, or watch its scale while that is not known.
 
         Args:
-            start: The start.
             newest: State of the newest frame.
             later: States of the frames that have come since the start, to the newest.
         """

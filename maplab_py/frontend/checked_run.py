@@ -40,7 +40,6 @@ def run_checked(
     Args:
         make: Prepares a run over a recording.
         recording: The recording; it is read several times.
-        progress: Told of the progress; may cancel.
         is_to_end: Tells whether the user ends the run.
         is_repeatable: A run that has started may be repeated: nobody has used its states.
 

@@ -60,7 +60,6 @@ def finish(
         mapping: A run that has ended.
         recording_name: For the report.
         map_key: Name of the map in memory, for the report.
-        progress: Told of the progress; may cancel.
         is_to_end: Tells whether to end now with what there is: the map is then not optimised.
 
     Raises:

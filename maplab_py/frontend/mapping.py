@@ -133,7 +133,6 @@ class Mapping:
         """Read the recording to its end, to the first error, or until the user ends it.
 
         Args:
-            progress: Told of every frame; may cancel the run.
             is_to_end: Tells whether the run is to end now with what it has.
 
         Raises:

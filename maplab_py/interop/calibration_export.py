@@ -23,7 +23,6 @@ def exported(
     """Return file names and contents.
 
     Args:
-        sensors: All sensors.
         imu_id: IMU.
         rig_id: Camera rig.
         form: maplab, kalibr, openvins or basalt.

@@ -117,13 +117,11 @@ def export_csv_dataset(
     """Write the tables of each mission into `folder/<mission id>`.
 
     Args:
-        vi_map: Map.
         folder: Output folder; created if it does not exist.
         options: Tables to write.
         missions: Mission rows; None = all.
         projector: Write projected descriptors instead of their bytes; None = bytes.
         overwrite: Replace files that exist.
-        progress: Reports progress by file.
 
     Raises:
         UserError: A file exists and `overwrite` is not set (nothing is written then), or a file

@@ -40,7 +40,6 @@ def read_imu_csv(path: Path, time_unit: str = "", *, in_order: bool = True) -> I
     """Read a table of IMU samples: columns as their names say, without names those of EuRoC.
 
     Args:
-        path: File.
         time_unit: Unit of the time stamps; empty = see `stamps`.
         in_order: Refuse stamps that do not increase.
 

@@ -141,7 +141,6 @@ def read_text_table(
     The names of the columns may stand in any line that has as many words as the rows.
 
     Args:
-        path: File.
         kind: Kind of its rows, which bounds the distances between their stamps.
         unit: Unit of the stamps, from --time_unit; empty = concluded.
         span_ns: First and last time of what was recorded beside it.

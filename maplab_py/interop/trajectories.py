@@ -98,7 +98,6 @@ def read_trajectory(
     read, also those that contradict each other.
 
     Args:
-        path: File.
         time_unit: Unit of the time stamps; empty = see `stamps`.
 
     Raises:

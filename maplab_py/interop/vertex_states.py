@@ -45,7 +45,6 @@ def vertex_states(
     """Collect the states of vertices.
 
     Args:
-        vi_map: Map.
         missions: Mission rows; None = all.
         reference_sensor_id: Sensor or camera of the poses; empty = each mission's IMU.
         at_imu_times: States at every IMU sample between the vertices: cubic position (which uses

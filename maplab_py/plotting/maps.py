@@ -29,7 +29,6 @@ def trajectories(
     """Draw the missions from above, x to the right, y upwards, in the global frame G.
 
     Args:
-        vi_map: The map.
         missions: Rows of the missions to draw; None = all.
         landmarks: Draw the landmarks behind them (those not judged bad).
         p_G_truth: True positions (N, 3) in G, drawn as a black line.

@@ -97,7 +97,6 @@ def inertial_states(vi_map: VIMap, mission: int) -> Figure:
     """Draw position, velocity and the two biases of a mission's vertices over time.
 
     Args:
-        vi_map: The map.
         mission: Row of the mission.
 
     Raises:

@@ -113,7 +113,6 @@ def linearised(
     """Triangulate tracks and return their residuals.
 
     Args:
-        tracks: All tracks.
         chosen: Rows (n,) of the tracks.
         T_G_I: Current poses (V, 7) of all vertices.
         T_I_C: Current poses (C, 7) of the cameras on the IMU.

@@ -34,10 +34,8 @@ def select_by_gain(
     original.
 
     Args:
-        vi_map: The map.
         options: What to estimate, and the threshold.
         missions: Missions (rows, None = all).
-        progress: Reports one step per candidate.
         max_segments: Stop when this many are selected; 0 = evaluate all.
 
     Raises:

@@ -19,9 +19,7 @@ def with_cloud_loops(vi_map: VIMap, map_folder: Path, progress: Progress) -> tup
     """Add edges between clouds that are near one another; see `close_cloud_loops`.
 
     Args:
-        vi_map: The map.
         map_folder: Folder of the published map, which has the clouds.
-        progress: May cancel.
 
     Returns:
         The map, and why no clouds were registered; empty where some were, or there are none.

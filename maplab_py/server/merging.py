@@ -336,7 +336,6 @@ class Merger:
 
         Args:
             vi_map: The part of the map in which submaps (numbers `searched`) are compared.
-            progress: May cancel.
             pairs: Gets the pairs of missions that are aligned and not anchored.
             searched: Their submaps.
         """
@@ -370,7 +369,6 @@ class Merger:
             whole: The map.
             waiting: The missions, with the numbers of the submaps that showed the alignments.
             stretches: All submaps by number.
-            progress: May cancel.
         """
         if not waiting:
             return whole, ()

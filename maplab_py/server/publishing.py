@@ -65,7 +65,6 @@ class Publisher:
         """Return a submap whose resources are, or will be, where those of the map are.
 
         Args:
-            submap: The submap.
             folder: Where its resource files are.
 
         Raises:
@@ -85,10 +84,8 @@ class Publisher:
         """Replace the published map.
 
         Args:
-            vi_map: The map.
             compress: Compress its files. That takes most of the time of a publication, so files that the
                 next submap may change are stored as they are.
-            progress: Shown meanwhile.
 
         Raises:
             UserError: The disk refuses.

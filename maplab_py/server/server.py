@@ -67,7 +67,6 @@ class MapServer:
             stationary: When a submap stands still.
             incremental: What is optimised when.
             service: Where the service listens, and what is kept.
-            progress: Hears of every event; may cancel the server.
             watch: Gets every published map.
             shown_at: Address of the page that shows it, for the log.
 

@@ -277,7 +277,6 @@ def dense_points_in_range(
     """Return the points (N, 3) in G of dense resources in a sphere, and how many clouds they are from.
 
     Args:
-        vi_map: The map.
         map_folder: Where it was loaded from.
         type_number: Type of the resources: clouds or depth maps.
         center_G: Centre (3,) of the sphere [m].

@@ -285,7 +285,6 @@ def with_resources_taken_in(whole: VIMap, submap: VIMap) -> VIMap:
 
     Args:
         whole: The map, joined with the submap.
-        submap: The submap.
     """
     folders = whole.metadata.external_resource_folders
     name = merge.resource_folder_name(submap.metadata)

@@ -52,7 +52,6 @@ def status_of(
     """Return the state of a server that runs.
 
     Args:
-        server: The server.
         journal: What is published.
         preparing: Submaps in workers.
         pending: Robots of all submaps that are not published.

@@ -61,7 +61,6 @@ def detect(
     """Simulate detector and tracker on the images of one camera.
 
     Args:
-        camera: The camera.
         poses: Where it is, and when.
         world: Points and what hides them.
         is_there: Mask (L,) of the points that exist in this session.

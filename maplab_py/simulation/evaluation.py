@@ -196,8 +196,6 @@ def calibration_errors(
     """Compare the sensors of every mission with the truth.
 
     Args:
-        vi_map: The map.
-        truth: The truth.
         missions: Row (M,) of the truth's missions for each mission of the map, -1 = unknown.
     """
     return tuple(
@@ -314,7 +312,6 @@ def count_merges(seen: Sightings, truth: Truth, point_of_landmark: I64) -> Merge
 
     Args:
         seen: The map's observations.
-        truth: The truth.
         point_of_landmark: World point (L,) of the map's landmarks, see `shown_points`.
     """
     known = seen.track >= 0

@@ -211,7 +211,6 @@ def write_images(
         painted: The scene as this session sees it.
         folders: Where the images go.
         threads: How many images are rendered at a time; None = as many as there are processors.
-        progress: Is told about every image.
 
     Raises:
         UserError: A file cannot be written.

@@ -23,7 +23,6 @@ def write(folder: Path, known: Mapping[str, str] | None = None) -> str:
     """Write the checksums of a map's files, without resources, and return them (`listing`).
 
     Args:
-        folder: Map folder.
         known: Checksums of files (paths in the folder) that need not be read.
     """
     listed = listing(folder, known)
@@ -44,7 +43,6 @@ def verify(folder: Path, listed: str = "") -> None:
     """Compare all files with the side file, if there is one.
 
     Args:
-        folder: Map folder.
         listed: Checksums of the files (`listing`) if they are known already.
 
     Raises:
@@ -88,7 +86,6 @@ def listing(folder: Path, known: Mapping[str, str] | None = None) -> str:
     """Return one line per file of a map, without resources: checksum and path, sorted by path.
 
     Args:
-        folder: Map folder.
         known: See `write`.
 
     Raises:

@@ -70,11 +70,9 @@ def load_map(
     """Load a map and check that it is consistent.
 
     Args:
-        folder: Map folder.
         max_size_megabytes: Bound of the unpacked size of one file.
         repair: Where the two copies of an observation disagree, keep what both say, and drop what is no
             number.
-        progress: Shown while reading.
         listed: Checksums of its files (`checksums.listing`) if they are known already.
 
     Raises:
@@ -113,7 +111,6 @@ def with_small_files(
     """Return a map from the cache with what its small files say: sensors, metadata, names.
 
     Args:
-        folder: Map folder.
         cached: Columns from the cache.
         listed: Checksums of the map's files.
         max_size_megabytes: Bound of the size of one file.

@@ -66,7 +66,6 @@ def save_map(
     folder that the map uses for new resources.
 
     Args:
-        vi_map: Map.
         folder: Map folder; made with its parents when it does not exist.
         overwrite: Replace a map that is there.
         known: Fingerprint of the map that is there as the caller knows it (see
@@ -81,7 +80,6 @@ def save_map(
         written: What the folder had after its last save, and where it is noted for the next one:
             files that would not change are taken over, in a partition of its own.
         repair: Drop what is no number instead of refusing it; see `number_repair`.
-        progress: Shown while writing.
 
     Raises:
         MapError: The map violates a rule without which it could not be loaded.
@@ -137,7 +135,6 @@ def check_target(
     """Check that a map may be saved to a folder; see `save_map`.
 
     Args:
-        folder: The folder.
         overwrite: See `save_map`.
         known: See `save_map`.
         force: See `save_map`.

@@ -51,7 +51,6 @@ def coloured_mesh(mesh: Cloud, colouring: MeshColouring, reference: Cloud | None
     """Return a mesh in the colours that a rule gives it.
 
     Args:
-        mesh: Mesh.
         colouring: "shaded" is one colour, "colour" those of the mesh, "height" by z, "distance" by the
             distance of every vertex from the reference; "auto" is the distance with a reference, else the
             mesh's colours if it has some, else one colour.
@@ -101,7 +100,6 @@ def field_slice(
     """Return the voxels at a height in G, coloured by their distances.
 
     Args:
-        vi_map: Map.
         map_folder: Its folder.
         missions: Rows of missions; None = all.
         height_m: Height; None = the median of the vertices.

@@ -199,8 +199,6 @@ class VertexImages:
         """Find the images of a type.
 
         Args:
-            vi_map: Map.
-            folder: Its folder.
             name: Type; empty = the first type of images that the map has.
             with_depth: Show the depth map of a vertex below its image.
         """

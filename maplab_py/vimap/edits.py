@@ -35,7 +35,6 @@ def remove_missions(vi_map: VIMap, missions: ArrayLike) -> VIMap:
     position in G. Loop closure edges to the removed missions are removed.
 
     Args:
-        vi_map: The map.
         missions: Mission rows or a mask (M,).
     """
     removed = as_mask(missions, len(vi_map.missions))
@@ -76,7 +75,6 @@ def merge_landmarks(vi_map: VIMap, from_rows: ArrayLike, into_rows: ArrayLike) -
     other keypoints are detached.
 
     Args:
-        vi_map: The map.
         from_rows: Landmark rows (N,).
         into_rows: Landmark rows (N,).
     """
@@ -135,7 +133,6 @@ def add_landmarks(
     """Append landmarks and attach keypoints to them.
 
     Args:
-        vi_map: The map.
         vertex: Store vertex (N,) of each new landmark.
         p_I: Position (N, 3) in the body frame of that vertex [m].
         keypoint_rows: Observing keypoints (O,); they are detached from their previous landmark.
@@ -192,7 +189,6 @@ def with_new_ids(vi_map: VIMap, rng: np.random.Generator | None = None) -> VIMap
     map gets the same new ids in every run, and different ones each time it is applied again.
 
     Args:
-        vi_map: The map.
         rng: Source of the ids.
     """
     if rng is None:

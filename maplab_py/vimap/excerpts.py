@@ -129,7 +129,6 @@ def excerpt(vi_map: VIMap, vertices: ArrayLike, *, observed_by: ArrayLike | None
     observe. A landmark that another vertex stores is stored in its first observer of the part.
 
     Args:
-        vi_map: The map.
         vertices: Vertex rows or a mask (V,).
         observed_by: Vertices (rows or a mask) of which one must observe a landmark of the part; None
             = any of the part.

@@ -24,7 +24,6 @@ class SharedColumns:
         """Return the bytes of the columns of a map that no map before has.
 
         Args:
-            vi_map: Map.
             size_of: Bytes of a column that count.
         """
         total = 0

@@ -170,7 +170,6 @@ def remove_vertices_counted(vi_map: VIMap, vertices: ArrayLike) -> tuple[VIMap, 
     edges, absolute poses and resources of removed vertices are removed.
 
     Args:
-        vi_map: The map.
         vertices: Vertex rows or a mask (V,).
 
     Raises:
@@ -209,7 +208,6 @@ def stores_for(vi_map: VIMap, landmarks: I64, vertex_kept: Mask, *, same_mission
     """Return a kept vertex (N,) for each landmark: its first kept observer.
 
     Args:
-        vi_map: The map.
         landmarks: Landmark rows (N,).
         vertex_kept: Vertices (V,) that may store them.
         same_mission: Use an observer of the landmark's mission, else its nearest kept vertex

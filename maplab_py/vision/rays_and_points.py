@@ -21,7 +21,6 @@ def points_near_rays(rays: Rays, point_start: I64, point: F64) -> tuple[I64, I64
     """Return rows of rays and points (N,) of one problem whose directions differ by the radius at most.
 
     Args:
-        rays: The rays.
         point_start: Offsets (P + 1,) of each problem's points.
         point: Points (M, 3) in the frame of the rays.
     """

@@ -63,14 +63,12 @@ def anchor_missions(
     closures are recorded in the map, unless they anchored no mission.
 
     Args:
-        vi_map: The map.
         options: When missions count as aligned.
         loop_options: How places are recognised.
         missions: Mission rows to anchor; None = all unknown ones. Others may serve as bridges.
         choice: An alignment that a person has chosen; `options.hypothesis` is one, too.
         absolute: When the absolute poses of a mission count as agreeing.
         projections: Keeps the descriptor projection from one call to the next; None = it is learned.
-        progress: Progress.
 
     Raises:
         UserError: The chosen alignment does not exist.

@@ -36,9 +36,7 @@ def split_by_position(
     map: where the overlap is shorter than an edge, the edge's second vertex is added to a cell of the first.
 
     Args:
-        vi_map: The map.
         options: Number of cells and overlap.
-        progress: Shown meanwhile.
 
     Raises:
         UserError: The map has fewer vertices than cells are wanted.
@@ -65,7 +63,6 @@ def _add_second_vertices(vi_map: VIMap, is_inside: Mask, home: I64) -> None:
     """Put the second vertex of edges that lie in no cell into the cell (V,) of the first, in place.
 
     Args:
-        vi_map: The map.
         is_inside: Whether a vertex is in a cell (cells, V).
         home: Cell of each vertex.
     """
@@ -151,7 +148,6 @@ def join_cells(cells: Sequence[VIMap], *, progress: Progress = SILENT) -> tuple[
 
     Args:
         cells: Maps; at equal depth earlier ones count more.
-        progress: Shown meanwhile.
 
     Raises:
         MapError: The cells have no vertex, share no mission, differ in calibrations, or in the number

@@ -47,11 +47,9 @@ def close_cloud_loops(
     An edge of an earlier search between the same clouds is replaced.
 
     Args:
-        vi_map: The map.
         map_folder: Folder of the map, for its resources.
         options: Candidates, registration and gates.
         missions: Missions (rows); None = all.
-        progress: Is told about every pair.
 
     Raises:
         UserError: There are no clouds, or a library is missing.

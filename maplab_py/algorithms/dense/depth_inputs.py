@@ -82,7 +82,6 @@ def fuse_views(
         resources: Rows (K,) of the resources.
         poses: Poses (K, 7) of their cameras in the frame of the grid.
         settings: Of the grid.
-        progress: Is told about every depth map.
         with_free_space: The grid also has the space between cameras and surfaces.
 
     Raises:

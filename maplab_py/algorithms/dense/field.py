@@ -81,7 +81,6 @@ def distance_field(
         cameras: Positions (K, 3) of the cameras in the frame of the grid.
         options: Largest distance, and the spheres around the cameras.
         min_weight: Weight from which voxels count as observed for the mesh.
-        progress: Is told about the blocks.
 
     Raises:
         EstimationError: The grid has no surface of this weight.
@@ -121,7 +120,6 @@ def _observed(grid: TsdfGrid, order: I64, rows: I64, min_weight: float) -> tuple
     """Return which voxels (b, 8, 8, 8) are known, and which of these lie behind a surface.
 
     Args:
-        grid: Grid.
         order: Rows of its blocks in the order of their coordinates.
         rows: Places (b,) of the blocks in that order, -1 = not in the grid.
         min_weight: See `distance_field`.
@@ -254,7 +252,6 @@ def create_fields(
     the first of its missions and is in the frame of that mission.
 
     Args:
-        vi_map: Map.
         map_folder: Its folder.
         missions: Rows of missions; None = all.
         options: Distances.
@@ -262,7 +259,6 @@ def create_fields(
         min_weight: Weight from which voxels count as observed for the surface.
         input_type: Number of the resource type of the depth; None = see `depth_type`.
         overwrite: Replace fields that the missions have.
-        progress: Is told about every depth map and the blocks.
 
     Raises:
         UserError: There is no depth, or a mission has a field already.

@@ -74,14 +74,12 @@ def fuse_depth(
     A grid belongs to the first of its missions and is in the frame of that mission.
 
     Args:
-        vi_map: Map.
         map_folder: Its folder.
         missions: Rows of missions; None = all.
         options: Voxels and weights.
         input_type: Number of the resource type of the depth; None = the first of optimised depth
             maps, raw depth maps and clouds that there is.
         overwrite: Replace grids that the missions have.
-        progress: Is told about every depth map.
 
     Raises:
         UserError: There is no depth, or a mission has a grid already.
@@ -144,13 +142,11 @@ def update_grids(
     Depth resources that the map does not have any more are errors, because nothing could take them out.
 
     Args:
-        vi_map: Map.
         map_folder: Its folder.
         missions: Rows of missions; None = all.
         options: What is not at its default must be as in the grids; None = all defaults.
         input_type: Number of the resource type that must be in the grids; None = any.
         threshold_m: Frames whose points at a distance of 2 m have moved by more are integrated again.
-        progress: Is told about every depth map.
 
     Raises:
         UserError: The missions have no grid, or one of other options.
@@ -244,7 +240,6 @@ def _follow(
         resources: Rows (K,) of those in the grid.
         moved: Which of them (K,) have moved.
         T_M_C: Present poses (K, 7) of those, the poses in the grid of the others.
-        progress: Is told about every depth map.
     """
     grid, indices = stored.grid, np.flatnonzero(moved).tolist()
     for index in indices:

@@ -37,7 +37,6 @@ def map_mesh(
     """Return the surface of the grids of missions in G, and the number of grids.
 
     Args:
-        vi_map: Map.
         map_folder: Its folder.
         missions: Rows of missions; None = all.
         min_weight: Weight from which voxels count as observed.
@@ -106,11 +105,9 @@ def vertex_colours(
     1 / depth^2. Points that no image shows are grey.
 
     Args:
-        vi_map: Map.
         map_folder: Its folder.
         p_G: Points in the global frame.
         missions: Rows of missions; None = all.
-        progress: Is told about every image.
 
     Raises:
         UserError: No frame has both an image and a depth map.

@@ -94,13 +94,11 @@ def reconstruct_stereo(
     """Compute depth for every vertex that has images of a stereo pair.
 
     Args:
-        vi_map: Map.
         map_folder: Its folder.
         missions: Rows of missions; None = all.
         settings: Options.
         output_type: Number of the resource type of the results, one of OUTPUT_TYPES.
         overwrite: Replace resources of this type that the frames have.
-        progress: Is told about every vertex.
 
     Raises:
         UserError: There are no images or no stereo pair, or a frame has depth already.

@@ -42,7 +42,6 @@ def evaluate_trajectory(
         ground_truth: Poses in the order of time.
         options: What to compare and how.
         missions: Mission rows; None = all.
-        progress: Checked once for cancelling.
 
     Raises:
         EstimationError: Fewer than three vertices have ground truth, or they cannot be aligned.
@@ -103,7 +102,6 @@ def clock_hint(
     """Return a clause on the offset of the clocks that leaves a much smaller error; empty without one.
 
     Args:
-        vi_map: Map.
         rows: Vertices; of several missions the longest is compared.
         ground_truth: Poses or positions in the order of time.
         options: What to compare and how.

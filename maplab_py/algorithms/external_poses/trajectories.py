@@ -264,7 +264,6 @@ def without_edges(
     """Remove the edges of a kind of a mission (row) and the sensors that nothing else needs.
 
     Args:
-        vi_map: Map.
         mission: Row of the mission.
         kind: Kind of the edges.
         source: Name of the file that has others.

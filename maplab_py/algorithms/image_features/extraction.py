@@ -39,11 +39,9 @@ def extract_features(
     does not depend on the number of threads.
 
     Args:
-        vi_map: The map.
         map_folder: Its folder, where its resources are.
         options: What is extracted.
         missions: Mission rows, None for all.
-        progress: Progress.
 
     Raises:
         UserError: The missions have no images, frames have keypoints that cannot be kept, or there is

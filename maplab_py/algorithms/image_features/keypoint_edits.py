@@ -57,7 +57,6 @@ def with_features(
     """Append features to frames, after the keypoints that they have.
 
     Args:
-        vi_map: The map.
         frames: Frame rows, each once; their keypoints have descriptors.
         features: Features of each.
         kind: Kind of their descriptors.

@@ -41,10 +41,8 @@ def track_features(
     that would put two keypoints of a frame into one track.
 
     Args:
-        vi_map: The map.
         options: Kind of the keypoints and limits of matches.
         missions: Mission rows, None for all.
-        progress: Progress.
 
     Raises:
         EstimationError: There are no such keypoints, or all have a track.

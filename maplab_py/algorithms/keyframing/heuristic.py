@@ -40,10 +40,8 @@ def keyframe(
     vertices; landmarks stay where they are but lose the removed observations.
 
     Args:
-        vi_map: The map.
         options: When a vertex becomes a keyframe.
         missions: Mission rows; None = all.
-        progress: Reports progress and checks for cancellation.
     """
     reason = choose_keyframes(vi_map, options, missions=missions, progress=progress)
     chosen = mission_mask(vi_map, missions)[vi_map.vertices.mission]

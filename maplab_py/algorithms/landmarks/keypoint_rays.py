@@ -103,7 +103,6 @@ def landmark_covariance(vi_map: VIMap, landmarks: I64, sigma_px: ArrayLike) -> F
     Landmarks without rays (lidar) have unknown position.
 
     Args:
-        vi_map: The map.
         landmarks: Landmark rows (N,).
         sigma_px: Standard deviation of keypoints: of all, or (K,) of each keypoint of the map.
     """

@@ -43,10 +43,8 @@ def evaluate_quality(
     of the closest, with no large reprojection error.
 
     Args:
-        vi_map: The map.
         options: The thresholds.
         missions: Mission rows; None = all.
-        progress: Reports progress and checks for cancellation.
 
     Raises:
         MapError: A mission's camera rig or IMU is not in sensors.yaml.
@@ -146,7 +144,6 @@ def predicted_sigma(vi_map: VIMap, landmarks: I64) -> F64:
     freedom: 2 ln 2). The median ignores single wrong observations.
 
     Args:
-        vi_map: The map.
         landmarks: Landmark rows (N,).
     """
     keypoints = vi_map.observations[ragged_rows(vi_map.observation_start, landmarks)]

@@ -46,10 +46,8 @@ def remove_invalid_observations(
     quality if they can be triangulated and agree.
 
     Args:
-        vi_map: The map.
         options: The limits.
         missions: Rows of the missions that store the landmarks; None = all.
-        progress: Reports progress and checks for cancellation.
 
     Raises:
         MapError: A mission's camera rig or IMU is not in sensors.yaml.

@@ -26,12 +26,10 @@ def init_tracks(
     All landmarks of the missions are triangulated afterwards, as in maplab.
 
     Args:
-        vi_map: The map.
         options: Thresholds of the quality.
         missions: Mission rows; None = all.
         across_cameras: Track ids are unique in a mission: keypoints of different cameras with the
             same id show the same point.
-        progress: Reports progress and checks for cancellation.
 
     Raises:
         MapError: A mission's camera rig or IMU is not in sensors.yaml.

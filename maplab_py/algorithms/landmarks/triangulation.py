@@ -25,10 +25,8 @@ def retriangulate(
     bad. Store vertices do not change, nor do landmarks of 3-D (lidar) observations.
 
     Args:
-        vi_map: The map.
         options: Thresholds of the quality.
         missions: Mission rows; None = all.
-        progress: Reports progress and checks for cancellation.
 
     Raises:
         MapError: A mission's camera rig or IMU is not in sensors.yaml.
@@ -62,7 +60,6 @@ def triangulate_keypoints(vi_map: VIMap, keypoints: I64, start: I64) -> tuple[F6
     """Triangulate groups of keypoints.
 
     Args:
-        vi_map: The map.
         keypoints: Keypoint rows (O,), grouped.
         start: Offsets (L + 1) of the groups.
 

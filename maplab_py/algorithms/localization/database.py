@@ -112,7 +112,6 @@ def database_of_map(
     they determined.
 
     Args:
-        vi_map: The map.
         missions: Mission rows.
         projection: Projection of the descriptors; None = learned from the tracks.
         feature_type: Type of the descriptors.

@@ -156,7 +156,6 @@ def landmarks_in_view(landmarks, view, rows, toward):  # type: ignore[no-untyped
     """Find landmarks that may be visible and lie in the cone; return how many.
 
     Args:
-        landmarks: All landmarks.
         view: Pose of the body and cone.
         rows: Output (L,): rows of these landmarks, ascending.
         toward: Output (L, 3): unit vectors toward them, in the body frame.

@@ -56,10 +56,8 @@ def localize_missions(
     Args:
         database: Where to localise; it is not changed.
         vi_map: The map whose vertices are the queries; it is not changed.
-        options: Thresholds.
         missions: Mission rows of the queries.
         sequence_length: Vertices whose images make up one query.
-        progress: Progress.
 
     Raises:
         EstimationError: The query has no descriptors, or of another length than the map's.

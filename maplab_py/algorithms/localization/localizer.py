@@ -75,7 +75,6 @@ class Localizer:
 
         Args:
             database: Where to localise.
-            options: Thresholds.
         """
         self._map = database
         self._options = options

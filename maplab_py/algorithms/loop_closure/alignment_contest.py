@@ -140,7 +140,6 @@ def decide(
     """Decide every pair of different missions.
 
     Args:
-        vi_map: The map.
         pairs: Alignments of pairs; those of a mission and itself reveal places that look alike.
         stretch: Stretch (V,) of each vertex.
         rule: Criteria.

@@ -176,7 +176,6 @@ def _best_places(vi_map: VIMap, queries: I64, votes: Any, near: Any, rule: Candi
     """Return rows [query vertex, place vertex, votes] of the best places per query and mission.
 
     Args:
-        vi_map: The map.
         queries: Query vertices (Q,).
         votes: Votes (Q, V), sparse.
         near: Vertices (V, V) that belong to one place, sparse.

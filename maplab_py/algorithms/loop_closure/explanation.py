@@ -148,12 +148,10 @@ def explain_pair(
     If the map has no record of closures between them, they are searched for; the map does not change.
 
     Args:
-        vi_map: The map.
         first: Mission row.
         second: Another one.
         options: Thresholds of closures.
         min_anchoring_closures: Accepted closures that anchoring needs.
-        progress: Progress of the search.
 
     Raises:
         EstimationError: No descriptors, or too few tracks to learn their projection.
@@ -304,7 +302,6 @@ def acceptance(
     may estimate other poses.
 
     Args:
-        vi_map: The map.
         closures: All recorded closures.
         row: The closure.
         options: The present flags.

@@ -66,7 +66,6 @@ def map_features(
     that two or more keypoints observe form the database.
 
     Args:
-        vi_map: The map.
         missions: Mission rows.
         projection: Projection of descriptors.
         dimensions: Dimensions of a projection that is learned; None = as many as in summary maps.
@@ -128,7 +127,6 @@ def most_frequent_kind(
     """Return the most frequent kind of descriptors of a type, and which keypoints (K,) have it.
 
     Args:
-        vi_map: The map.
         wanted: Frames (F,) to look at.
         feature_type: Type of the descriptors.
         sizes: Lengths [bytes] that they may have; empty = any.

@@ -125,7 +125,6 @@ def measure(
     """Measure closures (N) with estimated poses, before any of them is compared with others.
 
     Args:
-        vi_map: The map.
         query: Query vertices (N,).
         place: Vertices of the places (N,).
         solutions: Estimated poses.
@@ -238,12 +237,10 @@ def judge(
     """Apply all gates: geometry, plausible drift, ambiguity, consensus of neighbours.
 
     Args:
-        vi_map: The map.
         query: Query vertices (N,).
         place: Vertices of the places (N,).
         T_M_I: Poses (N, 7) of the queries in the missions of the places.
         measured: Values of `measure`; closures that are not accepted there stay refused.
-        options: Thresholds.
         choice: An alignment of two missions that a person has chosen.
 
     Returns:

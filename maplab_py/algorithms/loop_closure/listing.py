@@ -33,7 +33,6 @@ def list_closures(
     """Return the recorded closures.
 
     Args:
-        vi_map: The map.
         which: "accepted", "refused" or "all" closures.
         missions: Only closures with an end in these missions (rows); None = all.
         sort_by: "time" of the query, or "gap", "correction" (largest first), "inliers" (fewest
@@ -117,7 +116,6 @@ def find_closures(vi_map: VIMap, prefixes: list[str], *, neighbours_s: float = 0
     """Return the ids (N, 2) of recorded closures from prefixes of their ids.
 
     Args:
-        vi_map: The map.
         prefixes: Prefixes of ids, each of a single closure.
         neighbours_s: Also select accepted closures with both ends within this time.
 

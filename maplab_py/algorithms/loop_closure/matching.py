@@ -324,7 +324,6 @@ def remembered(
         descriptors: What is searched for and in.
         columns: What else the result depends on.
         setting: Its parameters.
-        search: The search.
         memory: Where results are kept.
     """
     digest = hashlib.blake2b(setting.encode(), digest_size=32)

@@ -196,8 +196,6 @@ def compare_landmarks(
     """Compare landmarks of queries with those of places.
 
     Args:
-        vi_map: The map.
-        closures: The closures.
         closure: Row of the closure (N,) that matched them; its covariance is known.
         source: Landmark (N,) that the query sees.
         target: Landmark (N,) of the place.
@@ -273,7 +271,6 @@ def unite(vi_map: VIMap, votes: Votes, min_votes: int) -> United:
     for one.
 
     Args:
-        vi_map: The map.
         votes: Verified observations; the landmarks of a vote differ.
         min_votes: Number of query vertices.
     """

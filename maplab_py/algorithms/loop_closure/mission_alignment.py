@@ -214,7 +214,6 @@ def unmatched_share(vi_map: VIMap, pair: MissionPair, alignment: Alignment, stre
     """Return the share of stretches without a match among those that must have one.
 
     Args:
-        vi_map: The map.
         pair: Two missions, or a mission and itself.
         alignment: One of their alignments.
         stretch: Stretch (V,) of each vertex; its numbers increase along a mission.

@@ -292,7 +292,6 @@ def _as_before(vi_map: VIMap, recorded: MergedLandmarks, rows: I64, vertex: I64)
     """Give landmarks that lost all they were merged with their recorded position and quality.
 
     Args:
-        vi_map: The map.
         recorded: Landmarks before merging.
         rows: Rows (N,) of these.
         vertex: Vertex rows (N,) that the recorded positions are relative to.

@@ -49,12 +49,9 @@ def match_again(
     Images of the same camera at the query and at the place's vertex are compared.
 
     Args:
-        vi_map: The map.
         features: Its XFeat features.
         matches: Matches of all candidates.
-        candidates: The candidates.
         which: Rows of those that are matched again.
-        progress: Progress.
 
     Raises:
         UserError: The network is not installed.

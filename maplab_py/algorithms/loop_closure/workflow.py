@@ -44,10 +44,8 @@ def close_loops(
 
     Args:
         vi_map: The map; the quality of landmarks is evaluated first where it is unknown.
-        options: Thresholds.
         missions: Mission rows, None for all.
         scope: What is left out.
-        progress: Progress.
 
     Raises:
         EstimationError: No descriptors, or too few tracks to learn their projection.

@@ -56,7 +56,6 @@ def find_changes(vi_map: VIMap, later: Mask, progress: Progress = SILENT) -> Cha
     Args:
         vi_map: The map; all missions are anchored, and landmarks that both saw are merged.
         later: Later missions (M,).
-        progress: May cancel.
 
     Raises:
         UserError: There are no earlier or no later missions.

@@ -78,11 +78,9 @@ def thin(
     """Remove landmarks that no longer exist, and what exceeds the budget.
 
     Args:
-        vi_map: The map.
         new: Missions (M,) whose vertices keep their inertial measurements.
         options: The budget.
         persistence: Priors of existence.
-        progress: May cancel.
 
     Raises:
         UserError: The size cannot be met.

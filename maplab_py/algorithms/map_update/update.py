@@ -110,7 +110,6 @@ def update_map(
         loops: How places are recognised.
         keyframing: Of the session.
         assign_new_ids: Whether the session may be in the map already; it is added once more.
-        progress: May cancel.
 
     Raises:
         UserError: No mission of the map is anchored, or the budget cannot be met.
@@ -322,10 +321,8 @@ def gather_all(
     """Add the evidence of all anchored missions, in the order of time, and judge the landmarks.
 
     Args:
-        vi_map: The map.
         persistence: Priors of existence.
         at_s: Time of the probabilities [s since 1970]; None = that of the last mission.
-        progress: May cancel.
 
     Raises:
         EstimationError: The map has no descriptors.

@@ -78,7 +78,6 @@ def disturb_vertices(
     Landmarks move with the vertices that store them; velocities rotate with their vertex.
 
     Args:
-        vi_map: The map.
         options: Magnitude of the random walks.
         missions: Mission rows; None = all.
     """

@@ -49,10 +49,8 @@ def diagnose(
     """Check a recording.
 
     Args:
-        recording: Recording.
         stream: Part of it, and how it is synchronised.
         first_s: Look at so many seconds only; 0 = all.
-        progress: Told of the progress.
 
     Raises:
         MapError: A table of it is damaged.

@@ -86,11 +86,9 @@ def read_signals(
     """Read a recording.
 
     Args:
-        recording: Recording.
         stream: Part of it, and how it is synchronised.
         first_s: Look at images of so many seconds, and read on only until both images and samples have
             come; 0 = read all.
-        progress: Told of the progress.
 
     Raises:
         MapError: A table of it is damaged.

@@ -21,7 +21,6 @@ def check_times(signals: Signals, stream: StreamOptions, *, is_whole: bool) -> I
     """Yield findings on the times of samples and images.
 
     Args:
-        signals: Signals.
         stream: Limits of gaps, and of the times of partners.
         is_whole: The recording was read to its end.
     """

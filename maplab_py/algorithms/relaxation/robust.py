@@ -82,7 +82,6 @@ def optimize_robustly(
         loops: Loop closures.
         tilt: Priors of roll and pitch.
         options: Robustness and iterations.
-        progress: Shows iterations and cancels.
 
     Raises:
         EstimationError: The poses are not determined, or not finite.

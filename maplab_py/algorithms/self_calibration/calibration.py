@@ -90,10 +90,8 @@ def calibrate(
 
     Args:
         vi_map: Segments of a database, or a whole map.
-        options: What to estimate.
         missions: Missions (rows, None = all).
         segments: Number of segments, for the report.
-        progress: Shown one line an iteration.
 
     Raises:
         EstimationError: The data do not determine the calibration; the message names the

@@ -65,8 +65,6 @@ def calibrate_with_checks(
     """Calibrate; where a camera moves too far, keep its position and calibrate the rest again.
 
     Args:
-        vi_map: The map.
-        options: What to estimate.
         max_camera_shift_m: How far a camera may move from where it was; 0 = no limit.
         parts: Also calibrate on so many parts of the data, and report deviations that are at least
             the standard error of their mean; 0 = none.
@@ -74,7 +72,6 @@ def calibrate_with_checks(
         missions: Missions (rows, None = all).
         batch: Use all data instead of segments.
         selector: Another way to select segments; then there is no database.
-        progress: Shown one line an iteration.
 
     Raises:
         EstimationError: The data do not determine the calibration.

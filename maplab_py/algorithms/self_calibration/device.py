@@ -110,7 +110,6 @@ def with_calibration_file(
     camera where it is on the IMU.
 
     Args:
-        vi_map: Map.
         calibration: File.
         missions: Mission rows of one device; None = all.
         imu_noise: Take over the IMU's noise densities.

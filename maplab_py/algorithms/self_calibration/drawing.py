@@ -21,7 +21,6 @@ def draw(vi_map: VIMap, segments: list[I64], information: Sequence[float], title
     """Return an SVG of the trajectory; segments (vertex rows) are coloured by rank of their score.
 
     Args:
-        vi_map: The map.
         segments: Vertex rows.
         information: Scores (S,); less is more.
         title: Heading.

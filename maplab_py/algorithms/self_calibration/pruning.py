@@ -58,7 +58,6 @@ def prune(
         calibration: To test against; None = the joint calibration of all segments.
         probability: Of accepting a segment if the calibration is right.
         capacity: Segments per table; 0 = as many as it has.
-        progress: Shown while segments are tested.
 
     Raises:
         EstimationError: Half of the segments contradict their joint calibration.
@@ -135,7 +134,6 @@ def test_segments(
         sensors: The calibration; of other ids, when it has one IMU and one rig.
         options: What was estimated.
         probability: Of accepting a segment if the calibration is right.
-        progress: Shown while segments are tested.
 
     Raises:
         UserError: The calibration is of other cameras, or it is not clear of which.

@@ -155,7 +155,6 @@ def choose_greedily(problem: CoverageProblem, start: Mask | None = None) -> Mask
     (Nemhauser et al. 1978).
 
     Args:
-        problem: The problem.
         start: Mask (L,) of landmarks selected already, at most as many as are kept.
     """
     chosen = np.zeros(problem.landmarks, dtype=np.bool_) if start is None else start.copy()
@@ -188,7 +187,6 @@ def exchange(problem: CoverageProblem, chosen: Mask, *, most: int = 2000) -> Mas
     """Swap selected landmarks for others as long as the objective increases.
 
     Args:
-        problem: The problem.
         chosen: A selection (L,).
         most: Maximum number of swaps.
     """

@@ -56,11 +56,9 @@ def sparsify(
     landmarks keeps them all.
 
     Args:
-        vi_map: The map.
         keep: Landmarks to keep.
         options: Method and parameters of the selection.
         persistence: Priors of existence, where the map has evidence.
-        progress: Progress.
 
     Raises:
         UserError: `keep` is not positive, or there is no good landmark.
@@ -284,7 +282,6 @@ def landmark_scores(vi_map: VIMap, landmarks: I64, *, threshold_bits: float) -> 
     the number of observing missions, each relative to its 95th percentile and at most 1.
 
     Args:
-        vi_map: The map.
         landmarks: Landmark rows (N,).
         threshold_bits: Mean distance of descriptors from their majority, in bits of 384, up to
             which they count as stable.

@@ -157,7 +157,6 @@ def map_size(
         vi_map: The map; it is not changed.
         folder: Where it is on disk.
         keyframing: Options of the keyframing that is tried.
-        progress: Progress.
     """
     kinds = bytes_by_kind(vi_map)
     total = max(sum(size for _, size in kinds.values()), 1)

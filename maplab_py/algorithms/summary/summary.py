@@ -43,7 +43,6 @@ def make_summary_map(
         projection: Projection of the descriptors; by default learned from the map's tracks.
         feature_type: Type of the descriptors.
         sizes: Lengths [bytes] that they may have; empty = any.
-        progress: Progress.
 
     Raises:
         EstimationError: No good landmark has descriptors of the type, or too few tracks to learn from.
@@ -159,7 +158,6 @@ def _spread(rows: I64, features: MapFeatures, most: int) -> I64:
 
     Args:
         rows: Feature rows sorted by landmark.
-        features: The features.
         most: Maximum number of observations per landmark.
     """
     label = features.descriptors.label[rows]

@@ -37,7 +37,6 @@ def thinned(vi_map: VIMap, keypoints: I64, options: DataOptions) -> tuple[I64, L
     """Return the observations (keypoint rows) that the limits leave, in order.
 
     Args:
-        vi_map: The map.
         keypoints: Observations (O,), grouped by landmark.
         options: The limits.
 
@@ -243,7 +242,6 @@ def observations(
     """Return the observations, all active, and their sigmas [px].
 
     Args:
-        vi_map: Map.
         selection: Selected vertices and landmarks.
         options: Scales of the loss.
         first_camera: (M,) row of each mission's first camera.

@@ -44,12 +44,10 @@ def optimize_around(
     """Optimise vertices (rows) and what they touch.
 
     Args:
-        vi_map: The map.
         vertices: New vertices; always free, unless they are a whole cluster without a fixed vertex.
         options: Of the optimisation.
         max_free: Largest number of further free vertices.
         max_fixed: Largest number of fixed vertices, besides the neighbours along trajectories.
-        progress: Shown meanwhile.
 
     Raises:
         EstimationError: Nothing can be optimised.

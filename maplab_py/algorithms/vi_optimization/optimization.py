@@ -36,11 +36,9 @@ def optimize(
     """Optimise the free states of some missions (rows, None = all).
 
     Args:
-        vi_map: The map.
         options: See there.
         missions: Mission rows.
         fixed_vertices: Vertices (rows) whose states are held fixed.
-        progress: Shown meanwhile.
         watch: Called between iterations.
 
     Returns:

@@ -126,7 +126,6 @@ def toolbar_text(session: Session, columns: int = 0) -> str:
     """Return the line below the prompt: what is selected, unsaved, running and announced.
 
     Args:
-        session: The session.
         columns: Width of the terminal; counts are left out where it is too narrow. 0 = any.
     """
     facts: list[str] = []

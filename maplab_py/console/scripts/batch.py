@@ -47,7 +47,6 @@ def read_batch(path: Path, maps_folder: Path | None = None) -> Batch:
     """Read a batch file with the keys `vi_map_folder_paths` and `commands` or `stages`.
 
     Args:
-        path: The file.
         maps_folder: Run on the maps in this folder and below it, not on those that the file lists.
 
     Raises:

@@ -70,7 +70,6 @@ def run_as_pipeline(
 
     Args:
         batch: What the file says.
-        path: The file.
         options: Where the tasks run.
         session: Has the lasting flags that all commands get.
         terminal: Where status and report go.

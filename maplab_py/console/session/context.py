@@ -51,7 +51,6 @@ class CommandContext:
 
         Args:
             session: The session that runs the command.
-            progress: Reports progress and detects cancellation.
             terminal: Asks questions.
             command: Name of the command, for messages and the undo history.
             is_trial: Everything that the command does is discarded (--dry_run).

@@ -46,7 +46,6 @@ def residual_kernel(
     Args:
         name: Name of the residual, unique among all kernels.
         make_function: Makes the casadi function (inputs...) -> residual (m), Jacobian (m, D).
-        progress: Told when something has to be compiled.
     """
     return generated_module(name, lambda: _batch_source(make_function()), progress)
 

@@ -54,7 +54,6 @@ def generated_module(
     Args:
         name: Module name: which kernels for which models.
         make_source: Writes the source; called only when the cache does not have it.
-        progress: Told when something has to be generated and compiled.
     """
     qualified = f"{_PREFIX}{name}"
     if qualified in sys.modules:

@@ -159,7 +159,6 @@ def angular_velocity_at_vertices(vi_map: VIMap, vertices: NDArray[np.integer] | 
     a vertex without either is taken to stand still.
 
     Args:
-        vi_map: Map.
         vertices: Vertices whose velocities are wanted, None = all; those of others may be zero.
     """
     result = np.zeros((len(vi_map.vertices), 3))

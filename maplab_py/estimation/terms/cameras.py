@@ -39,7 +39,6 @@ def camera_blocks(cameras: Cameras, timing_s: F64) -> tuple[ParameterBlock, ...]
     """Return the blocks of C cameras, in the order of the kernels' columns.
 
     Args:
-        cameras: The cameras.
         timing_s: Image delays (C,) or (C, 1); (C, 2) with the time between two rows, for kernels that
             estimate line delays.
     """

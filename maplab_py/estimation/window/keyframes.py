@@ -16,11 +16,9 @@ def needs_keyframe(
     Parallax is the median angle between the rays of the same tracks in M, so that turning gives none.
 
     Args:
-        tracks: All tracks.
         T_M_I: Poses (F, 7) of the frames.
         T_I_C: Poses (C, 7) of the cameras on the IMU.
         keyframe: Row of the last keyframe.
-        options: Thresholds.
     """
     newest = len(T_M_I) - 1
     before, now = tracks.is_seen_by(keyframe), tracks.is_seen_by(newest)

@@ -31,7 +31,6 @@ def shows_parallax(
     Args:
         frame: The new frame, whose observations are not among the tracks yet.
         times_ns: Times (F,) of the frames before it.
-        tracks: All tracks.
         T_M_I: Poses (F + 1, 7) of the frames and, as predicted, of the new one.
         T_I_C: Poses (C, 7) of the cameras on the IMU.
         back_projection: Of the cameras.
@@ -68,7 +67,6 @@ def is_on_the_spot(
         frame: The frame, with the samples that lead to it.
         motion: Its predicted motion (9,) [v, b_g, b_a].
         covariance: Of the state before it (15, 15), order [p, theta, v, b_g, b_a].
-        options: Thresholds.
     """
     v_M, gyro_bias = motion[:3], motion[3:6]
     speed_mps = float(np.linalg.norm(v_M))

@@ -74,7 +74,6 @@ def add_scatter(rays: PairedRays, R_i_j: F64, weight: F64, normal: F64, scatter:
     """Compute the normals (M, 3) of the rays' planes, and sum their squares (P, 3, 3) by pair.
 
     Args:
-        rays: The rays.
         R_i_j: Turn (P, 3, 3) from the second to the first frame of each pair.
         weight: Robust weights (M,).
         normal: Result.
@@ -109,7 +108,6 @@ def add_equations(
     A ray's residual is its distance to the plane of the other ray and the direction of translation.
 
     Args:
-        rays: The rays.
         R_i_j: Turn (P, 3, 3) from the second to the first frame of each pair.
         slope: Right perturbation (P, 3, K) of that turn by the unknowns: the bias, and what else there is.
         direction: Direction of translation and its tangent plane, as columns (P, 3, 3).

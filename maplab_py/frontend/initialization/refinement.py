@@ -124,7 +124,6 @@ class Refinement:
         """Prepare kernels for the cameras, with poses T_I_C (C, 7), and the IMU.
 
         Args:
-            cameras: The cameras.
             T_I_C: Their poses.
             imu: With the noise that is assumed.
             biases: What is known of them.

@@ -46,13 +46,11 @@ def export_bag(
     the map's times; all others are of the IMU's clock.
 
     Args:
-        vi_map: Map.
         map_folder: Folder of the map, where its resources are.
         mission: Row of the mission.
         path: File of a ROS 1 bag, or folder of a ROS 2 bag.
         options: Parts and format.
         overwrite: Replace a bag that exists.
-        progress: Told of the progress.
 
     Raises:
         UserError: The bag cannot be written, or the mission has none of the parts.

@@ -47,7 +47,6 @@ def check_camera_info(message: Any, name: str, camera: Camera, tolerance_px: flo
     """Compare a CameraInfo with a camera of the map.
 
     Args:
-        message: The message.
         name: Bag and topic.
         camera: Camera that the images are said to be of.
         tolerance_px: Largest distance between the pixels of the same ray.
@@ -181,11 +180,9 @@ def import_bag_resources(
     Images of the encodings 16UC1 (millimetres) and 32FC1 (metres) are depth maps.
 
     Args:
-        vi_map: Map.
         mission: Row of the mission.
         path: Bag.
         options: Topic, sensor and times.
-        progress: Told of the progress.
 
     Raises:
         UserError: It is no bag, a topic is missing or of another type, the calibration is of another

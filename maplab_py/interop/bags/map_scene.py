@@ -33,12 +33,10 @@ def export_mcap(
     Landmarks, closures and paths have the time of the first vertex, so that they are there at once.
 
     Args:
-        vi_map: Map.
         map_folder: Folder of the map, where its images are.
         path: Folder to write; it has an .mcap of the same name.
         images: Write the images among the resources, too.
         overwrite: Replace a recording that exists.
-        progress: Told of the progress.
 
     Raises:
         UserError: The map has no vertices, or the recording cannot be written.

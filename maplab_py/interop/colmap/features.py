@@ -198,11 +198,9 @@ def with_features(
     """Return the map with the descriptors and scales of a database, and notes.
 
     Args:
-        vi_map: Map.
         names: Name of the image of each frame (F).
         uv: Keypoints (K, 2) as the model has them.
         database: COLMAP's database.
-        progress: Is told about every image.
 
     Raises:
         UserError: There is no such file.

@@ -183,7 +183,6 @@ def image_times(
         names: Names of the images.
         source: name = the last number in the file's name; file = lines of name and time stamp; order =
             images in the order of their names without folders, which equal frames share.
-        file: The file.
         interval_s: Time between images by order [s].
         time_unit: Unit of the stamps; empty = see `stamps`.
 

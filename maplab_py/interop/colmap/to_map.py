@@ -53,7 +53,6 @@ def body_frames(model: ColmapModel, times_ns: I64, side: SideFile | None) -> Bod
     """Put the frames that have images into missions: those of the side file, else one of each rig.
 
     Args:
-        model: Model.
         times_ns: Times (N,) of its images.
         side: Side file, None = there is none.
 
@@ -119,7 +118,6 @@ def map_of_model(
     """Return the map of a model whose world W lies in G by a similarity.
 
     Args:
-        model: Model.
         bodies: Its frames by mission.
         times_ns: Times (N,) of its images.
         side: Side file, None = there is none.

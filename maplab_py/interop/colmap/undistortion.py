@@ -21,7 +21,6 @@ def perspective_model(model: ColmapModel, work: Path, undistort: Callable[[], No
     """Return the model with PINHOLE cameras and undistorted keypoints where maplab lacks a model.
 
     Args:
-        model: Model.
         work: Folder of the job `undistort`, which runs on `pixels.npz` there.
         undistort: Runs the job.
     """

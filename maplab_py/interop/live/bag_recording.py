@@ -83,7 +83,6 @@ def record_bag(
         options: Topics and duration.
         silence_s: End when nothing has arrived for so long; 0 = never.
         overwrite: Replace a bag that exists.
-        progress: Told of the progress; may cancel.
         is_to_end: Tells whether to end now, with what there is.
 
     Raises:

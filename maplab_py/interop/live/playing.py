@@ -71,7 +71,6 @@ def play_recording(
         kind: One of `TRANSPORTS`.
         network: Where.
         options: See there.
-        progress: Told of the progress; may cancel.
         is_to_end: Tells whether to end now.
 
     Raises:

@@ -74,10 +74,8 @@ def summarise(
     """Read a recording and report what is in it; of one whose clock starts again, its first part.
 
     Args:
-        recording: Recording.
         options: Part of it, and how it is synchronised.
         check_images: Check size and completeness of all images of frame sets, without decoding.
-        progress: Told of the progress.
 
     Raises:
         MapError: The recording is empty or damaged.

@@ -50,12 +50,10 @@ def import_depth_maps(
     Depths must be along the optical axis, at the pixels of the camera's distorted image.
 
     Args:
-        vi_map: Map.
         mission: Row of the mission.
         camera: Index of the camera in its rig.
         folder: Has the files <time stamp in ns>.png.
         options: Scale and tolerance.
-        progress: Is told about every file.
 
     Raises:
         UserError: There are no files, no such camera, or no file belongs to a frame.

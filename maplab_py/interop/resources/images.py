@@ -116,13 +116,11 @@ def export_images(
     """Write the images of a mission's frames as the folders cam0, cam1, ... of an EuRoC folder.
 
     Args:
-        vi_map: Map.
         map_folder: Folder of the map, where its resources are.
         mission: Row of the mission.
         kind: Number of the resource type.
         folder: Gets mav0.
         overwrite: Replace files that exist.
-        progress: Is told about every image.
 
     Raises:
         UserError: The mission has no such images, or a file cannot be written.

@@ -145,11 +145,9 @@ def import_point_clouds(
     mission are left out, as are those of times that the sensor has a cloud of.
 
     Args:
-        vi_map: Map.
         mission: Row of the mission.
         folder: Has the files <time stamp in ns>.ply or .pcd.
         sensor_id: Sensor, or an unambiguous prefix; empty = the mission's lidar.
-        progress: Is told about every file.
 
     Raises:
         UserError: There are no files, no such sensor, or no file is of a time of the mission.
@@ -207,7 +205,6 @@ def add_clouds(
         new: Gets the clouds.
         chosen: Rows (N,).
         clouds: Row, and what reads its cloud.
-        progress: Is told about every cloud.
 
     Raises:
         MapError: A cloud is damaged, or all are empty.

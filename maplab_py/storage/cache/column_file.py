@@ -98,7 +98,6 @@ def read_columns(path: Path, facts: Mapping[str, Any]) -> tuple[VIMap, dict[str,
     The file may be replaced or deleted while it is mapped: the map keeps what it has.
 
     Args:
-        path: File.
         facts: What the header must say.
 
     Raises:

@@ -43,7 +43,6 @@ def read_resources(
     """Return all references, with the folder that resource_info gives for each.
 
     Args:
-        folder: Map folder.
         of_frames: Those of the frames (`resources_of_frames`).
         content: Missions.
         budget: Bound of memory.

@@ -69,7 +69,6 @@ def id_rows(ids: U64, tag: int) -> tuple[U8, Mask]:
     """Return ids (N, 2) as bytes (N, 24), and which of them are used.
 
     Args:
-        ids: The ids.
         tag: Tag of the field that has them.
     """
     varints, sizes = _varints(ids.byteswap())

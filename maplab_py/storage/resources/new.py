@@ -105,7 +105,6 @@ class NewResources:
         """Return the map with new resources.
 
         Args:
-            vi_map: Map.
             rows: Resources (N,), as `add` returned them.
             owner: Owners (N,): rows of frames, or of missions for missions and sensors.
             owner_kind: What owns them.

@@ -59,7 +59,6 @@ class ResourceStore:
         """Serve the resources of a map that was loaded from `map_folder`.
 
         Args:
-            vi_map: Map.
             map_folder: Its folder.
             max_bytes: Size of a cache of its own; None = the cache of the process.
         """
@@ -188,7 +187,6 @@ class ResourceCache:
         """Return the content of a file.
 
         Args:
-            path: File.
             kind: Number of its resource type.
             read: Reads the file; returns the content and its size in memory [bytes].
 

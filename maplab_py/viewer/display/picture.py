@@ -261,7 +261,6 @@ def export_html(
         server: The viser server that shows the scene.
         scene: What it shows.
         layers: Names of the layers that are visible at first; the others have nodes that are hidden.
-        path: The file.
         chooser: HTML of the slider of states, empty = none.
         is_dark: Theme.
 

@@ -410,8 +410,6 @@ def closure_picture(
     """Return a picture (H, W, 3) RGB of two vertices (rows) with their matches, and what it shows.
 
     Args:
-        vi_map: The map.
-        images: Its images.
         query: Vertex at the left.
         place: Vertex at the right.
 

@@ -80,7 +80,6 @@ def cloud_colours(cloud: Cloud, ranges: ColourRanges | None = None) -> U8:
     """Return the colours (N, 3) stored with the cloud; else by intensity, else by height.
 
     Args:
-        cloud: The cloud.
         ranges: Values of the first and the last colour; the cloud's own when not given.
     """
     if cloud.colours is not None:

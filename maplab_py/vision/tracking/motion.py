@@ -281,7 +281,6 @@ def image_motion(
     """Compare tracks in two images of a camera.
 
     Args:
-        camera: The camera.
         rays: Unit rays (K, 3) of the earlier and of the later image.
         uv_px: Keypoints (K, 2) of the later image, recorded pixels.
         R_C1_C0: Turn (3, 3) from the earlier to the later camera, None = unknown.

