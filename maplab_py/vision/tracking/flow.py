@@ -1,18 +1,16 @@
-"""Pyramidal Lucas-Kanade from a prediction, forwards and back again.
+"""Pyramidal Lucas-Kanade from a prediction, forwards and back again; see `flow_kernels`."""
 
-Source: J.-Y. Bouguet, Pyramidal Implementation of the Affine Lucas Kanade Feature Tracker, 2001,
-as OpenCV implements it; every keypoint is tracked by itself, whatever the number of threads.
-"""
+from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 
 from maplab_py.array_types import F64, U8, Mask
+from maplab_py.vision.tracking import flow_kernels
 
-_ITERATIONS, _CONVERGED_PX = 20, 0.01
-_MIN_EIGENVALUE = 1e-4
+_BORDER_PX = 16
+"""Border of the levels beyond two sides of a patch, so that those at the edge of an image can be compared."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,8 +22,34 @@ class FlowOptions:
     forward_backward_px: float
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Pyramid:
+    """An image, and it and its levels of half resolution with borders."""
+
+    image: U8  # (H, W)
+    border_px: int
+    levels: tuple[U8, ...]  # the image first
+
+    @classmethod
+    def of(cls, image: U8, options: FlowOptions) -> Pyramid:
+        """Make the levels that patches fit into."""
+        import cv2
+
+        border, level, levels = 2 * options.patch_size_px + _BORDER_PX, image, []
+        for _ in range(options.levels + 1):
+            if levels:
+                level = np.asarray(cv2.pyrDown(level), dtype=np.uint8)
+            if levels and min(level.shape) <= options.patch_size_px:
+                break
+            bordered = cv2.copyMakeBorder(
+                level, border, border, border, border, cv2.BORDER_REFLECT_101
+            )
+            levels.append(np.asarray(bordered, dtype=np.uint8))
+        return cls(image, border, tuple(levels))
+
+
 def follow(
-    first: U8, second: U8, uv: F64, predicted_uv: F64, options: FlowOptions
+    first: U8 | Pyramid, second: U8 | Pyramid, uv: F64, predicted_uv: F64, options: FlowOptions
 ) -> tuple[F64, Mask]:
     """Find keypoints of an image again in another one.
 
@@ -40,76 +64,67 @@ def follow(
         Keypoints (K, 2) in the second image, and whether they were found (K,): inside the image,
         and tracked back to where they came from.
     """
+    first, second = (
+        image if isinstance(image, Pyramid) else Pyramid.of(image, options)
+        for image in (first, second)
+    )
     there, is_tracked = search(first, second, uv, predicted_uv, options)
     return there, is_tracked & is_tracked_back(first, second, uv, there, options)
 
 
 def search(
-    first: U8, second: U8, uv: F64, predicted_uv: F64, options: FlowOptions
+    first: Pyramid,
+    second: Pyramid,
+    uv: F64,
+    predicted_uv: F64,
+    options: FlowOptions,
+    turn: F64 | None = None,
 ) -> tuple[F64, Mask]:
-    """Find keypoints as `follow` does, without the way back."""
-    there, is_tracked = _flow(first, second, uv, predicted_uv, options, options.levels)
-    height, width = second.shape
+    """Find keypoints as `follow` does, without the way back, with a turn (2, 2) of the image."""
+    there, is_tracked = _flow(first, second, uv, predicted_uv, options, len(first.levels), turn)
+    height, width = second.image.shape
     inside = np.all((there >= 0.0) & (there <= np.array([width - 1, height - 1])), axis=1)
     return there, is_tracked & inside
 
 
-def is_tracked_back(first: U8, second: U8, uv: F64, there: F64, options: FlowOptions) -> Mask:
+def is_tracked_back(
+    first: Pyramid,
+    second: Pyramid,
+    uv: F64,
+    there: F64,
+    options: FlowOptions,
+    turn: F64 | None = None,
+) -> Mask:
     """Tell which keypoints (K, 2) are tracked from the second image back to where they came from."""
     # the way back starts at its end: it needs no pyramid
-    back, is_back = _flow(second, first, there, uv, options, 0)
+    back_turn = None if turn is None else np.ascontiguousarray(turn.T)
+    back, is_back = _flow(second, first, there, uv, options, 1, back_turn)
     error = np.linalg.norm(back - uv, axis=1)
     return np.asarray(is_back & (error <= options.forward_backward_px))
 
 
-def in_plane_turn(R_C1_C0: F64) -> float:
-    """Return the angle [rad] by which an image turns about the optical axis between two cameras."""
-    return float(np.arctan2(R_C1_C0[1, 0] - R_C1_C0[0, 1], R_C1_C0[0, 0] + R_C1_C0[1, 1]))
-
-
-def turn_matrix(angle_rad: float) -> F64:
-    """Return the matrix (2, 2) of a turn in the image."""
-    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
-    return np.array([[cos, -sin], [sin, cos]])
-
-
-def turned_in_plane(image: U8, uv: F64, centre: F64, angle_rad: float) -> tuple[U8, F64]:
-    """Turn an image (H, W) and its keypoints (K, 2) about a point.
-
-    Lucas-Kanade compares upright patches: where the camera turns about its axis, keypoints drift
-    (measured: 0.3 px in an image turned by 5 degrees, 0.02 px after this). Radial distortion does
-    not matter for a turn about the principal point.
-    """
-    import cv2
-
-    R = turn_matrix(angle_rad)
-    M = np.column_stack([R, centre - R @ centre])
-    height, width = image.shape
-    turned = cv2.warpAffine(image, M, (width, height), borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(turned, dtype=np.uint8), uv @ R.T + M[:, 2]
+def in_plane_turn(R_C1_C0: F64) -> F64:
+    """Return the turn (2, 2) of an image about the optical axis between two cameras."""
+    sin, cos = R_C1_C0[1, 0] - R_C1_C0[0, 1], R_C1_C0[0, 0] + R_C1_C0[1, 1]
+    length = np.hypot(sin, cos)
+    return np.array([[cos, -sin], [sin, cos]]) / length if length > 0.0 else np.eye(2)
 
 
 def _flow(
-    first: U8, second: U8, uv: F64, guess_uv: F64, options: FlowOptions, levels: int
+    first: Pyramid,
+    second: Pyramid,
+    uv: F64,
+    guess_uv: F64,
+    options: FlowOptions,
+    levels: int,
+    turn: F64 | None,
 ) -> tuple[F64, Mask]:
-    import cv2
-
-    if not len(uv):
-        return np.zeros((0, 2)), np.zeros(0, dtype=np.bool_)
-    flags: Any = cv2.OPTFLOW_USE_INITIAL_FLOW
-    end: Any = cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS
-    end_uv: Any
-    end_uv, status, _ = cv2.calcOpticalFlowPyrLK(
-        first,
-        second,
-        np.array(uv, dtype=np.float32, order="C").reshape(-1, 1, 2),
-        np.array(guess_uv, dtype=np.float32, order="C").reshape(-1, 1, 2),
-        winSize=(options.patch_size_px, options.patch_size_px),
-        maxLevel=levels,
-        criteria=(end, _ITERATIONS, _CONVERGED_PX),
-        flags=flags,
-        minEigThreshold=_MIN_EIGENVALUE,
-    )
-    end_uv = end_uv[:, 0].astype(np.float64)
-    is_tracked = (status[:, 0] > 0) & np.isfinite(end_uv).all(axis=1)
-    return np.where(is_tracked[:, None], end_uv, uv), is_tracked
+    there = np.array(guess_uv, dtype=np.float64, order="C")
+    is_tracked: Mask = np.zeros(len(uv), dtype=np.bool_)
+    turn = np.eye(2) if turn is None else turn
+    for level in range(levels - 1, -1, -1):
+        flow_kernels.follow_on_level(
+            first.levels[level], second.levels[level], first.border_px, options.patch_size_px,
+            0.5**level, turn, uv, there, is_tracked,
+        )  # fmt: skip
+    return np.where(is_tracked[:, None], there, uv), is_tracked

@@ -17,12 +17,11 @@ from maplab_py.vision.features import detection
 from maplab_py.vision.tracking import patch_kernels, stereo_kernels
 from maplab_py.vision.tracking.flow import (
     FlowOptions,
+    Pyramid,
     follow,
     in_plane_turn,
     is_tracked_back,
     search,
-    turn_matrix,
-    turned_in_plane,
 )
 from maplab_py.vision.tracking.motion import (
     ImageMotion,
@@ -35,8 +34,6 @@ from maplab_py.vision.tracking.options import TrackingOptions
 from maplab_py.vision.tracking.tracks import CameraTracks, TrackedImages
 from maplab_py.vision.tracking.views import CameraView, leaders, usable_alone
 
-_MIN_IN_PLANE_TURN_RAD = 0.01
-"""From this turn about the optical axis on, the earlier image is turned with the camera."""
 _ENOUGH_TRACKS, _CONTRADICTED_SHARE = 20, 0.3
 """The turn is looked for in the tracks when so small a share of so many of them agrees with the given one."""
 _SAME_POINT_PX = 3.0
@@ -47,7 +44,7 @@ _SAME_POINT_PX = 3.0
 class _CameraState:
     """The latest image of a camera, and the tracks that it follows by itself."""
 
-    image: U8
+    image: Pyramid
     tracks: LiveTracks
     shared: StereoMatches  # points of its leader
 
@@ -124,7 +121,7 @@ class FrameTracker:
         tracks = dataclasses.replace(
             tracks, track_id=shared.track_id[exists], num_frames=shared.num_frames[exists]
         )
-        return tracks.compared_with(patches(state.image, tracks.uv), tracks.warp)
+        return tracks.compared_with(patches(state.image.image, tracks.uv), tracks.warp)
 
     def track(
         self, time_ns: int, images: tuple[U8, ...], R_I0_I1: F64 | None = None
@@ -147,7 +144,9 @@ class FrameTracker:
         watch = _Stopwatch()
         with watch("prepare"):
             views = zip(self._views, images, strict=True)
-            prepared = [view.preparation.prepare(image) for view, image in views]
+            prepared = [
+                Pyramid.of(view.preparation.prepare(image), self._flow) for view, image in views
+            ]
         motions: list[ImageMotion] = []
         live: list[LiveTracks] = []
         for row, image in enumerate(prepared):
@@ -167,7 +166,7 @@ class FrameTracker:
                     live[row] = live[row][is_apart]
             if row not in self._absent:
                 with watch("detect"):
-                    live[row] = self._with_new(row, image, live[row], shared)
+                    live[row] = self._with_new(row, image.image, live[row], shared)
             output.append(self._output(row, shared, live[row]))
             matches.append(shared)
         self._states = tuple(map(_CameraState, prepared, live, matches))
@@ -189,7 +188,7 @@ class FrameTracker:
         return detection.GridDetector(self._options, usable)
 
     def _follow(
-        self, row: int, image: U8, R_I0_I1: F64 | None, seed: int, watch: _Stopwatch
+        self, row: int, image: Pyramid, R_I0_I1: F64 | None, seed: int, watch: _Stopwatch
     ) -> tuple[LiveTracks, ImageMotion | None]:
         """Follow the tracks of a camera into its new image."""
         if self._states is None or not len(self._states[row].tracks):
@@ -198,20 +197,17 @@ class FrameTracker:
         tracks = state.tracks
         with watch("flow"):
             R_C1_C0 = camera_turn(view.R_I_C, R_I0_I1)
-            before, start, guess, turn = state.image, tracks.uv, tracks.uv, np.eye(2)
+            guess, turn = tracks.uv, np.eye(2)
             if R_C1_C0 is not None:
                 turned, visible = view.pixels(tracks.ray @ R_C1_C0.T)
                 guess = np.where(visible[:, None], turned, tracks.uv)
-                angle_rad = in_plane_turn(R_C1_C0)
-                turn = turn_matrix(angle_rad)
-                if abs(angle_rad) > _MIN_IN_PLANE_TURN_RAD:
-                    before, start = turned_in_plane(before, start, view.centre, angle_rad)
-            uv, is_tracked = search(before, image, start, guess, self._flow)
-            aligned = align(image, uv, tracks.patch, turn @ tracks.warp)
+                turn = in_plane_turn(R_C1_C0)
+            uv, is_tracked = search(state.image, image, tracks.uv, guess, self._flow, turn)
+            aligned = align(image.image, uv, tracks.patch, turn @ tracks.warp)
             # what the first image of its track confirms need not be tracked back
             doubtful = np.flatnonzero(is_tracked & ~aligned.is_shown)
             is_tracked[doubtful] = is_tracked_back(
-                before, image, start[doubtful], uv[doubtful], self._flow
+                state.image, image, tracks.uv[doubtful], uv[doubtful], self._flow, turn
             )
             ray, exists = view.rays(aligned.uv)
             rows = np.flatnonzero(is_tracked & exists & view.is_usable(aligned.uv))
@@ -231,7 +227,7 @@ class FrameTracker:
         return tracks.at(aligned.uv[rows], ray[rows]), motion
 
     def _shared(
-        self, leader: int, row: int, images: tuple[U8, U8], tracks: LiveTracks
+        self, leader: int, row: int, images: tuple[Pyramid, Pyramid], tracks: LiveTracks
     ) -> tuple[LiveTracks, StereoMatches]:
         """Find the tracks of the leader in a camera; return these with distances, and the matches."""
         matches = match(self._views[leader], self._views[row], images, tracks, self._stereo)
@@ -375,7 +371,7 @@ class StereoMatches:
 def match(
     first: CameraView,
     second: CameraView,
-    images: tuple[U8, U8],
+    images: tuple[Pyramid, Pyramid],
     tracks: LiveTracks,
     options: StereoOptions,
 ) -> StereoMatches:

@@ -43,11 +43,6 @@ class CameraView:
             RayTable.of(camera),
         )
 
-    @property
-    def centre(self) -> F64:
-        """Principal point (2,) in the prepared image."""
-        return self.preparation.to_prepared(np.asarray(self.camera.intrinsics[-2:]))
-
     def rays(self, uv: F64) -> tuple[F64, Mask]:
         """Return unit rays (K, 3) and whether they exist."""
         return self.table.rays(self.preparation.to_recorded(uv))
