@@ -132,7 +132,7 @@ class DeviceCalibration:
                 self._add(request)
             else:
                 self._finish()
-        except MaplabError as error:
+        except (MaplabError, np.linalg.LinAlgError) as error:
             self._problem = str(error)
         return self.status()
 

@@ -106,7 +106,7 @@ def _stuck(values: np.ndarray, is_gyro: bool) -> np.ndarray:
 
 
 def _limited(values: np.ndarray, is_gyro: bool) -> np.ndarray:
-    limit = 0.25 if is_gyro else 8.5
+    limit = 0.25 if is_gyro else 7.0
     return np.clip(values, -limit, limit)
 
 

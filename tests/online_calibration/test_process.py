@@ -22,7 +22,9 @@ from maplab_py.errors import FlagError
 from maplab_py.online_calibration.options import OnlineCalibrationOptions
 from maplab_py.online_calibration.process import OPTIONS, DeviceCalibration, Finish, Opening, Piece
 from maplab_py.sensors.calibration_transfer import only_device
-from tests.online_calibration.recorded import pieces, session
+from maplab_py.simulation.scenario import MotionOptions
+from maplab_py.simulation.simulate import simulate
+from tests.online_calibration.recorded import device_scenario, pieces, session
 
 
 def opening(path: Path, device: object, **options: object) -> Opening:
@@ -80,6 +82,18 @@ def test_a_wrong_scale_is_found_and_a_calibration_proposed(tmp_path: Path) -> No
     assert imu.intrinsics is not None
     np.testing.assert_allclose(np.diag(imu.intrinsics.T_g), [e.after for e in scales], atol=1e-9)
     assert "sigma)" in options.options.proposal.read_text().splitlines()[1]
+
+
+def test_a_device_at_rest_says_nothing(tmp_path: Path) -> None:
+    rest = MotionOptions(kind="stationary", duration_s=8.1)
+    device, segments = pieces(simulate(device_scenario(rest)).maps[0])
+    calibration = DeviceCalibration(opening(tmp_path / "device.segments", device))
+    for piece in segments:
+        calibration.answer(piece)
+    status = calibration.answer(Finish())
+    assert status.evaluated == len(segments) == 2
+    assert status.problem == ""
+    assert status.contradiction is None
 
 
 def test_a_process_killed_at_any_time_leaves_a_whole_database(tmp_path: Path) -> None:

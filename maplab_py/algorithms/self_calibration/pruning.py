@@ -212,6 +212,8 @@ def estimate_segment(segment: VIMap, options: SelfCalibrationOptions) -> Segment
     )
     uncertainty = Uncertainty(parameters.prior_sigma, formal, robust)
     actual = uncertainty.covariance(formal_scale=max(fit, 1.0))
+    if not all(np.isfinite(values).all() for values in (change, formal, actual)):
+        raise EstimationError("a segment has no more measurements than unknowns: was it at rest?")
     return SegmentEstimate(parameters, change, formal, actual, fit)
 
 
