@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from concurrent.futures import Future
 from pathlib import Path
 
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions, TrackReport
@@ -13,9 +14,9 @@ from maplab_py.errors import EstimationError
 from maplab_py.frontend.backfill import Backfill
 from maplab_py.frontend.dead_reckoning import Tie, tied
 from maplab_py.frontend.failures.watch import SensorWatch, replace_failed
-from maplab_py.frontend.recorded_mission import RecordedMission, mission_map
+from maplab_py.frontend.recorded_mission import RecordedMission, VertexFrames, mission_map
 from maplab_py.frontend.run_options import MapBuilderOptions
-from maplab_py.interop.recordings.protocol import RecordedSensors, TrackedFrame
+from maplab_py.interop.recordings.protocol import RecordedSensors
 from maplab_py.progress import SILENT, Progress
 from maplab_py.storage.resources.new import NewResources
 from maplab_py.vimap import VIMap
@@ -54,7 +55,7 @@ class MapBuilder:
         if self._options.save_image_as_resources:
             self._images = NewResources(staging_parent, seed=seed)
         self._missions: list[RecordedMission] = []
-        self._waiting: dict[int, tuple[tuple[TrackedFrame | None, ...], list[int]]] = {}
+        self._waiting: dict[int, tuple[VertexFrames, list[int]]] = {}
 
     @property
     def missions(self) -> int:
@@ -113,11 +114,11 @@ class MapBuilder:
     def add_before_start(
         self,
         stamp_ns: int,
-        frames: Sequence[TrackedFrame | None],
+        frames: VertexFrames,
         images: Sequence[U8 | None] = (),
     ) -> None:
         """Keep a frame for which there is no state yet; see `add_vertex`."""
-        self._waiting[stamp_ns] = tuple(frames), self._image_rows(frames, images)
+        self._waiting[stamp_ns] = frames, self._image_rows(frames, images)
 
     def forget_before_start(self) -> None:
         """Forget the frames for which there is no state."""
@@ -141,7 +142,7 @@ class MapBuilder:
     def add_vertex(
         self,
         state: NavState,
-        frames: Sequence[TrackedFrame | None],
+        frames: VertexFrames,
         images: Sequence[U8 | None] = (),
         covariance: F64 | None = None,
     ) -> None:
@@ -149,7 +150,7 @@ class MapBuilder:
 
         Args:
             state: The state of the body then.
-            frames: Keypoints by camera; None where a camera has none. Descriptors are required.
+            frames: Keypoints by camera, maybe later; None where a camera has none. Descriptors are required.
             images: Images by camera, kept as resources if the options say so.
             covariance: Of the state (15, 15), order [p, theta, v, b_g, b_a]; None = not known.
 
@@ -157,17 +158,19 @@ class MapBuilder:
             UserError: An image cannot be written.
         """
         rows = self._image_rows(frames, images)
-        self._missions[-1].add_vertex(state, tuple(frames), rows, covariance)
+        self._missions[-1].add_vertex(state, frames, rows, covariance)
 
-    def _image_rows(
-        self, frames: Sequence[TrackedFrame | None], images: Sequence[U8 | None]
-    ) -> list[int]:
+    def _image_rows(self, frames: VertexFrames, images: Sequence[U8 | None]) -> list[int]:
         """Keep images as resources; return their rows, -1 where there is none."""
+        of_cameras = images if isinstance(frames, Future) else frames
+        has_keypoints = [frame is not None for frame in of_cameras]
         if self._images is None:
-            return [-1] * len(frames)
+            return [-1] * len(has_keypoints)
         return [
-            -1 if image is None or frame is None else self._images.add_image(image)
-            for frame, image in zip(frames, images or [None] * len(frames), strict=True)
+            self._images.add_image(image) if is_there and image is not None else -1
+            for is_there, image in zip(
+                has_keypoints, images or [None] * len(has_keypoints), strict=True
+            )
         ]
 
     def refine(self, states: NavState) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from array import array
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
@@ -23,13 +23,12 @@ from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.frontend.run_options import RunOptions
 from maplab_py.frontend.run_statistics import RunStatistics
 from maplab_py.frontend.starting import MakeStarter
-from maplab_py.frontend.vertex_keypoints import check_descriptors_exist, described_frames
+from maplab_py.frontend.vertex_keypoints import VertexKeypoints
 from maplab_py.interop.recordings.protocol import (
     Event,
     FrameSet,
     ImuBatch,
     Recording,
-    TrackedFrame,
 )
 from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.interop.trajectories import Trajectory
@@ -97,7 +96,8 @@ class Mapping:
         self._recording, self._observer, self._status = recording, observer, status
         self._on_estimate = on_estimate
         device, localization = recording.device, self.options.localization
-        check_descriptors_exist(self.options.odometry.tracking.descriptor_type)
+        features = localization.features or self.options.odometry.tracking.descriptor_type
+        self._keypoints = VertexKeypoints(features, self.options.builder.features_every)
         self.localization = opened_localization(localization, device, self.options.odometry)
         self.localized = LocalizationRecord()
         self.localized_frame: LocalizedFrame | None = None
@@ -272,7 +272,7 @@ class Mapping:
             builder.refine(update.released)
         if builder.is_due(update.time_ns):
             covariance = None if update.window is None else update.window.covariance
-            builder.add_vertex(update.state, _frames(update), update.images, covariance)
+            builder.add_vertex(update.state, self._keypoints.of(update), update.images, covariance)
         if update.backfill is not None:
             builder.fill(update.backfill)
 
@@ -283,7 +283,7 @@ class Mapping:
         if update.interval is None:
             builder.forget_before_start()
         if builder.is_due_before_start(update.stamp_ns):
-            builder.add_before_start(update.stamp_ns, _frames(update), update.images)
+            builder.add_before_start(update.stamp_ns, self._keypoints.of(update), update.images)
 
     def _tell_health(self, update: OdometryUpdate, progress: Progress) -> None:
         """Print how sure the estimate is."""
@@ -326,13 +326,6 @@ class Mapping:
             return f"{name}: there are no frames: choose another part or other cameras"
         reason = self.statistics.waiting_for or "the recording is too short"
         return f"{name}: the odometry has not started: {reason}"
-
-
-def _frames(update: OdometryUpdate) -> Sequence[TrackedFrame | None]:
-    """Return the keypoints of a frame with descriptors."""
-    if update.tracks is not None:
-        return update.tracks.frames
-    return described_frames(update.tracked, update.images, update.time_ns)
 
 
 def load_kernels() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import collections
 import hashlib
 from collections.abc import Sequence
+from concurrent.futures import Future
 
 import numpy as np
 
@@ -32,6 +33,9 @@ from maplab_py.vimap.tables import (
 )
 
 Frame = TrackedFrame | None
+VertexFrames = tuple[Frame, ...] | Future[tuple[TrackedFrame, ...]]
+"""Keypoints of a vertex by camera, or those that a thread describes."""
+_ALL = slice(None)
 _KEPT = 128
 """Vertices at the end whose covariances are kept: a few seconds without tracks are removed again."""
 
@@ -45,7 +49,7 @@ class RecordedMission:
     def __init__(self) -> None:
         """Start without vertices."""
         self.states: list[NavState] = []
-        self.frames: list[tuple[Frame, ...]] = []
+        self.frames: list[VertexFrames] = []
         self.image_rows: list[Sequence[int]] = []  # of new resources, -1 = none
         self.edges: list[tuple[I64, F64]] = []  # times and samples between vertices
         self.is_doubtful = False  # it has diverged: nothing can be tied to its end
@@ -91,7 +95,7 @@ class RecordedMission:
     def add_vertex(
         self,
         state: NavState,
-        frames: tuple[Frame, ...],
+        frames: VertexFrames,
         image_rows: Sequence[int],
         covariance: F64 | None = None,
     ) -> None:
@@ -114,6 +118,12 @@ class RecordedMission:
         self.states.append(state)
         self.frames.append(frames)
         self.image_rows.append(image_rows)
+
+    def described(self, rows: slice = _ALL) -> list[tuple[Frame, ...]]:
+        """Return the keypoints of vertices; waits for those that a thread describes."""
+        frames = [f.result() if isinstance(f, Future) else f for f in self.frames[rows]]
+        self.frames[rows] = frames
+        return frames
 
     def samples(self) -> tuple[I64, F64]:
         """Return the samples since the last vertex."""
@@ -152,7 +162,7 @@ class RecordedMission:
     def part(self, first: int, end: int | None = None) -> RecordedMission:
         """Return the vertices from a row on, before an end, with the samples between them."""
         result, rows = RecordedMission(), slice(first, end)
-        result.states, result.frames = self.states[rows], self.frames[rows]
+        result.states, result.frames = self.states[rows], [*self.described(rows)]
         result.image_rows = self.image_rows[rows]
         result.edges = self.edges[first : None if end is None else end - 1]
         return result
@@ -202,7 +212,8 @@ def mission_map(
     sensor_id[0, MissionSensor.IMU] = from_hex(device.imu_id)
     sensor_id[0, MissionSensor.NCAMERA] = from_hex(device.rig_id)
     edges, samples = _imu_tables(mission, edge_rng)
-    frames = _frame_table(mission, frame_rng)
+    described = mission.described()
+    frames = _frame_table(mission, described, frame_rng)
     vi_map = VIMap(
         sensors=device.sensors,
         missions=Missions.filled(
@@ -221,7 +232,7 @@ def mission_map(
             nframe_id=random_ids(count, set_rng),
         ),
         frames=frames,
-        keypoints=_keypoint_table(mission),
+        keypoints=_keypoint_table(described),
         imu_edges=edges,
         imu_samples=samples,
     )
@@ -250,10 +261,12 @@ def _imu_tables(mission: RecordedMission, rng: np.random.Generator) -> tuple[Imu
     return table, ImuSamples.filled(len(times), timestamp_ns=times, accel_gyro=samples)
 
 
-def _frame_table(mission: RecordedMission, rng: np.random.Generator) -> Frames:
+def _frame_table(
+    mission: RecordedMission, described: list[tuple[Frame, ...]], rng: np.random.Generator
+) -> Frames:
     """Return a row for each camera of each vertex; frames that are missing have no id."""
-    cameras = len(mission.frames[0])
-    frames = [frame for of_vertex in mission.frames for frame in of_vertex]
+    cameras = len(described[0])
+    frames = [frame for of_vertex in described for frame in of_vertex]
     count = len(frames)
     is_there = np.array([frame is not None for frame in frames])
     ids = random_ids(count, rng)
@@ -285,8 +298,8 @@ def _blocks(frame: Frame) -> tuple[DescriptorBlock, ...] | None:
     )
 
 
-def _keypoint_table(mission: RecordedMission) -> Keypoints:
-    frames = [frame for of_vertex in mission.frames for frame in of_vertex if frame is not None]
+def _keypoint_table(described: list[tuple[Frame, ...]]) -> Keypoints:
+    frames = [frame for of_vertex in described for frame in of_vertex if frame is not None]
     width = max((frame.descriptor.shape[1] for frame in frames), default=0)
     count = sum(len(frame.uv_px) for frame in frames)
     descriptor: U8 = np.zeros((count, width), dtype=np.uint8)

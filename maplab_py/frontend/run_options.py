@@ -35,6 +35,8 @@ class MapBuilderOptions(Options):
     """Largest rate of the vertices of the map"""
     save_image_as_resources: bool = option(False, flag="map_builder_save_image_as_resources")
     """Keep the images of the vertices as resources of the map"""
+    features_every: int = option(1, ge=1, flag="vio_localization_features_every")
+    """Vertices from one that a network describes to the next, in a thread; those between get brisk"""
 
 
 class OutputOptions(Options):

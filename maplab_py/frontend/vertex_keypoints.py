@@ -2,13 +2,60 @@
 
 from __future__ import annotations
 
+import collections
+from concurrent.futures import Future, ThreadPoolExecutor
+
 import numpy as np
 
 from maplab_py.array_types import U8, Mask
+from maplab_py.frontend.odometry_update import OdometryUpdate
+from maplab_py.frontend.recorded_mission import VertexFrames
 from maplab_py.interop.recordings.protocol import TrackedFrame
 from maplab_py.vision.features.description import describe
 from maplab_py.vision.features.extractors import KINDS
+from maplab_py.vision.features.options import NETWORKS
 from maplab_py.vision.tracking.tracks import CameraTracks, TrackedImages
+
+_BETWEEN = "brisk"
+"""Descriptors of vertices between those that a network describes."""
+_MOST_WAITING = 16
+"""Vertices whose images are kept for the thread; then the odometry waits for the oldest."""
+
+
+class VertexKeypoints:
+    """Describes the keypoints of vertices; a network does so in a thread beside the odometry."""
+
+    def __init__(self, features: str, every: int) -> None:
+        """Begin without vertices.
+
+        Args:
+            features: Name of the descriptors.
+            every: A network describes every so many vertices, the others get binary descriptors.
+
+        Raises:
+            UserError: The network is not installed.
+        """
+        check_descriptors_exist(features)
+        self._features, self._every, self._count = features, every, 0
+        self._thread: ThreadPoolExecutor | None = None
+        self._waiting: collections.deque[Future[tuple[TrackedFrame, ...]]] = collections.deque()
+
+    def of(self, update: OdometryUpdate) -> VertexFrames:
+        """Return the keypoints of a frame that becomes a vertex; those of a replay as they are."""
+        if update.tracks is not None:
+            return update.tracks.frames
+        given = update.tracked, update.images, update.time_ns
+        is_turn, self._count = self._count % self._every == 0, self._count + 1
+        if self._features not in NETWORKS:
+            return described_frames(*given, self._features)
+        if not is_turn:
+            return described_frames(*given, _BETWEEN)
+        self._thread = self._thread or ThreadPoolExecutor(1, "maplab-vertices")
+        if len(self._waiting) == _MOST_WAITING:
+            self._waiting.popleft().result()
+        future = self._thread.submit(described_frames, *given, self._features)
+        self._waiting.append(future)
+        return future
 
 
 def described_frames(

@@ -208,11 +208,11 @@ class _Worker:
 
 
 def _without_descriptors(recorded: RecordedMission) -> RecordedMission:
+    described = recorded.described()
     recorded.frames = [
-        tuple(None if frame is None else _bare(frame) for frame in frames)
-        for frames in recorded.frames
+        tuple(None if frame is None else _bare(frame) for frame in frames) for frames in described
     ]
-    recorded.image_rows = [[-1] * len(frames) for frames in recorded.frames]
+    recorded.image_rows = [[-1] * len(frames) for frames in described]
     return recorded
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from concurrent.futures import Future
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from maplab_py.storage.resources.store import ResourceStore
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.comparison import is_same
 from maplab_py.vimap.consistency import check_consistency
-from maplab_py.vimap.descriptors import FeatureType
+from maplab_py.vimap.descriptors import FeatureType, types_of
 from maplab_py.vimap.nav_state import NavState
 from tests.interop.small_map import make_map
 from tests.support.float_features import with_numbers
@@ -190,6 +191,31 @@ def test_missing_frames_keep_their_slot(stereo: VIMap) -> None:
     assert check_consistency(result).failure == ""
     assert result.frames.is_valid.tolist() == [True, True, False, True]
     assert result.frames.keypoint_count.tolist()[2:] == [0, 0]
+
+
+def test_vertices_may_be_described_later_and_otherwise(stereo: VIMap) -> None:
+    numbers = with_numbers(stereo, FeatureType.XFEAT)
+    builder = MapBuilder(MapRecording(stereo, 0).device, OFTEN)
+    builder.start_mission()
+    sets, described = (
+        [e for e in EventStream(MapRecording(each, 0)) if isinstance(e, TrackedFrameSet)][:6]
+        for each in (stereo, numbers)
+    )
+    later: list[Future[tuple[TrackedFrame, ...]]] = [Future() for _ in sets]
+    for row, frame_set in enumerate(sets):
+        if row:
+            times_ns = np.array([sets[row - 1].time_ns, frame_set.time_ns])
+            builder.add_imu(times_ns, np.zeros((2, 6)))
+        frames = frame_set.frames if row % 2 else later[row]
+        builder.add_vertex(states_of(stereo, row), frames, [None] * 2)
+    for future, frame_set in zip(later, described, strict=True):
+        future.set_result(tuple(frame for frame in frame_set.frames if frame is not None))
+    result, _ = builder.finish()
+    assert check_consistency(result).failure == ""
+    assert types_of(result.frames) == {FeatureType.BINARY, FeatureType.XFEAT}
+    of_vertex = result.keypoint_vertex % 2 == 0
+    assert np.array_equal(result.feature_type == FeatureType.XFEAT, of_vertex)
+    assert set(result.landmarks.feature_type.tolist()) == types_of(result.frames)
 
 
 def empty(frame: TrackedFrame | None) -> TrackedFrame:

@@ -22,8 +22,9 @@ class OnlineLocalizationOptions(Options, prefix="localization_"):
     map_folder: Path | None = option(None, flag="vio_localization_map_folder")
     """Map folder, or summary map, in which the recording is localised"""
     features: str = option("", choices=("", *DESCRIPTORS), flag="vio_localization_features")
-    """Descriptors of the keypoints of images that are matched with the map: brisk, or xfeat (a network,
-    which runs beside the odometry); empty = those that the map has"""
+    """Descriptors for localisation: of images that are matched with the map, and of the new map's vertices;
+    brisk, or xfeat (a network, which runs beside the odometry); empty = those that the map has, and
+    --feature_tracking_descriptor_type"""
     mode: str = option("vil", choices=MODES)
     """vil = matches and odometry in one estimate; swl = T_G_M over the window's matches, poses fixed; pose =
     T_G_M from poses of single images; odo = T_G_M from the first matches only"""

@@ -58,6 +58,21 @@ def test_a_full_map_serves_as_well() -> None:
     assert np.median(errors) < 0.05
 
 
+def test_the_next_frame_confirms_an_answer_with_many_matches() -> None:
+    from maplab_py.frontend.localization.map_source import of_map
+
+    for searched_map, is_certain in ((of_map(place().vi_map, "map"), True), (searched(), False)):
+        _, frames, _ = run(OPTIONS, searched_map)
+        answers = [frame.answer for frame in frames if frame.answer is not None]
+        assert (len(answers[0]) >= 30) is is_certain
+        waited_s = 1e-9 * (answers[1].time_ns - answers[0].time_ns)
+        frame_s = 1e-9 * (frames[1].time_ns - frames[0].time_ns)
+        assert (waited_s < 1.5 * frame_s) is is_certain
+        assert waited_s < 0.7
+        localized = [f.time_ns for f in frames if f.state is LocalizationState.LOCALIZED]
+        assert localized[0] <= answers[2].time_ns
+
+
 def test_the_index_alone_localises_too() -> None:
     localization, frames, _ = run(with_mode("vil", map_tracking=False))
     assert localization.counts.answers_by_tracking == 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Future
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,9 @@ import pytest
 
 from maplab_py.array_types import F64
 from maplab_py.errors import UserError
-from maplab_py.frontend.vertex_keypoints import described_frames
+from maplab_py.estimation.window.frame import Motion
+from maplab_py.frontend.odometry_update import OdometryStatus, OdometryUpdate
+from maplab_py.frontend.vertex_keypoints import VertexKeypoints, described_frames
 from maplab_py.vimap.descriptors import DescriptorDepth, FeatureType
 from maplab_py.vision.features.learned.checkpoint import Arrays
 from maplab_py.vision.features.learned.installation import check_image
@@ -143,3 +146,28 @@ def test_tracked_keypoints_get_descriptors_of_numbers(
     assert (frame.feature_type, frame.depth) == (FeatureType.XFEAT, DescriptorDepth.FLOAT32)
     assert (frame.descriptor_size == 256).all()
     assert np.array_equal(frame.descriptor.view("<f4"), network.describe(image, uv_px))
+
+
+def test_a_thread_describes_every_third_vertex(
+    network: XFeat, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("maplab_py.vision.features.learned.xfeat.installed_xfeat", lambda: network)
+    image = np.random.default_rng(2).integers(0, 256, (96, 128), dtype=np.uint8)
+    ids = np.arange(2)
+    uv_px = np.array([[60.0, 40.5], [70.25, 50.0]])
+    tracks = CameraTracks(uv_px, ids, np.ones(2), np.full(2, 12.0), ids)
+    tracked = TrackedImages(0, (tracks,), 0.0, False, {}, "brisk")
+    update = OdometryUpdate(
+        5, OdometryStatus.TRACKING, 0, tracked, Motion.MOVING, None, {}, images=(image,)
+    )
+    keypoints = VertexKeypoints("xfeat", 3)
+    frames = [keypoints.of(update) for _ in range(60)]
+    assert [isinstance(each, Future) for each in frames] == [True, False, False] * 20
+    (learned,), (binary,) = (
+        each.result() if isinstance(each, Future) else each for each in frames[-3:-1]
+    )
+    assert learned is not None
+    assert binary is not None
+    assert (learned.feature_type, binary.feature_type) == (FeatureType.XFEAT, FeatureType.BINARY)
+    assert np.array_equal(learned.descriptor.view("<f4"), network.describe(image, uv_px))
+    assert np.array_equal(learned.track_id, binary.track_id)
