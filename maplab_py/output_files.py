@@ -12,8 +12,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
 
-from maplab_py.atomic import PendingFile, replaced_file
-from maplab_py.atomic.files import reason, resolved
+from maplab_py.atomic import PendingFile, files, replaced_file
 from maplab_py.cancellation import cleaned_up
 from maplab_py.errors import UserError
 
@@ -60,7 +59,7 @@ class StagedFiles:
             UserError: It cannot be written.
             Cancelled: The running command has been cancelled.
         """
-        target = resolved(path)
+        target = files.resolved(path)
         for earlier in [pending for pending in self.files if pending.target == target]:
             self.files.remove(earlier)
             earlier.discard()
@@ -74,7 +73,7 @@ class StagedFiles:
                 pending.discard()
                 raise
         except OSError as error:
-            raise UserError(f"{path}: cannot be written ({reason(error)})") from error
+            raise UserError(f"{path}: cannot be written ({files.reason(error)})") from error
 
     def publish(self) -> None:
         """Rename all files to their final names.

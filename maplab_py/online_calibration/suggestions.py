@@ -20,8 +20,7 @@ from maplab_py.geometry import se3, so3
 from maplab_py.online_calibration.options import WantedSigmas
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
-from maplab_py.sensors import ImuIntrinsics, SensorSet
-from maplab_py.sensors.calibration_transfer import Device, only_device
+from maplab_py.sensors import ImuIntrinsics, SensorSet, calibration_transfer
 from maplab_py.simulation import scene, session, trajectory_motion
 from maplab_py.simulation import sensors as simulated
 from maplab_py.simulation.recording import SessionSeeds, record
@@ -239,7 +238,7 @@ def simulated_segment(
     sensors: SensorSet, motion: Motion, keyframes: int = 40, seed: int = 1
 ) -> VIMap:
     """Return a segment of a motion in a room, recorded by a device with exactly its calibration."""
-    device = only_device(sensors)
+    device = calibration_transfer.only_device(sensors)
     scenario = _scenario(sensors, device, keyframes)
     world = make_world(scenario.world, np.random.default_rng(seed))
     rigs = sensors.camera_rig(device.rig)
@@ -262,7 +261,7 @@ def simulated_segment(
     return session.session_map(scenario, world, of_scenario, recording, seeds)[0]
 
 
-def _scenario(sensors: SensorSet, device: Device, keyframes: int) -> Scenario:
+def _scenario(sensors: SensorSet, device: calibration_transfer.Device, keyframes: int) -> Scenario:
     imu, cameras = sensors.imu(device.imu), sensors.camera_rig(device.rig).cameras
     rate_hz = 10.0
     return Scenario(

@@ -24,8 +24,7 @@ from maplab_py.interop import imu_csv, trajectories
 from maplab_py.output_files import write_text
 from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors import Camera, Distortion, Imu, Projection
-from maplab_py.simulation import imaging, ray_caster, shading_kernels
-from maplab_py.simulation.reports import SimulatedMap, SimulatedMaps
+from maplab_py.simulation import imaging, ray_caster, reports, shading_kernels
 from maplab_py.simulation.scenario import Scenario
 from maplab_py.simulation.scene import make_scene
 from maplab_py.simulation.session import wheel_velocities, write_wheel_velocities
@@ -303,7 +302,7 @@ def write_maps(
     raw_data: bool = False,
     overwrite: bool = False,
     progress: Progress = SILENT,
-) -> SimulatedMaps:
+) -> reports.SimulatedMaps:
     """Simulate a scenario; write one map per session, the truth, and on request raw recordings.
 
     A new folder appears as a whole; in a folder with other files, each map is replaced by itself.
@@ -320,13 +319,13 @@ def write_maps(
             progress.check()
             save_map(vi_map, folder, overwrite=overwrite)
             counts = len(vi_map.vertices), len(vi_map.keypoints), len(vi_map.landmarks)
-            maps.append(SimulatedMap(map_folder / folder.relative_to(target), *counts))
+            maps.append(reports.SimulatedMap(map_folder / folder.relative_to(target), *counts))
         data.truth.save(target / TRUTH_FILE)
         folders: list[Path] = []
         if raw_data:
             folders = write_raw_data(scenario, data, target, overwrite=overwrite, progress=progress)
         written = tuple(map_folder / folder.relative_to(target) for folder in folders)
-    return SimulatedMaps(tuple(maps), map_folder / TRUTH_FILE, written)
+    return reports.SimulatedMaps(tuple(maps), map_folder / TRUTH_FILE, written)
 
 
 def session_folders(folder: Path, count: int) -> list[Path]:

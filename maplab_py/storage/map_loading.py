@@ -28,7 +28,6 @@ from maplab_py.storage.protobuf import (
     tables_from_messages,
 )
 from maplab_py.storage.protobuf.ids import ids_of
-from maplab_py.storage.protobuf.message_numbers import Name
 from maplab_py.storage.protobuf.scan import MemoryBudget
 from maplab_py.storage.protobuf.tables_from_messages import Content, required_rows, unique_index
 from maplab_py.storage.protobuf.vertex_parts import NO_TIME, JoinedParts, VertexPart
@@ -306,7 +305,7 @@ def _rows_of(kinds: list[str], kind: str) -> list[int]:
     return [k for k, row_kind in enumerate(kinds) if row_kind == kind]
 
 
-def _frame_namer(frames: Frames, vertex_name: Name) -> Name:
+def _frame_namer(frames: Frames, vertex_name: message_numbers.Name) -> message_numbers.Name:
     return lambda row: f"{vertex_name(int(frames.vertex[row]))}: frame {to_hex(frames.id[row])}"
 
 

@@ -23,7 +23,6 @@ from maplab_py.storage import maplab_map_pb2 as pb
 from maplab_py.storage.load_checks import check_loadable
 from maplab_py.storage.protobuf import map_files, tables_to_messages
 from maplab_py.storage.protobuf.descriptor_layout import LayoutChoice, with_layout
-from maplab_py.storage.protobuf.tables_to_messages import Partition
 from maplab_py.storage.resources.new import copied_files, with_staged_in_place
 from maplab_py.storage.unchanged_files import TakenOver, WrittenFiles
 from maplab_py.vimap import VIMap, number_repair
@@ -188,7 +187,7 @@ def _write(
     listing = pb.VIMapMetadata()
     _write_message(inner / map_files.MISSIONS, tables_to_messages.missions(vi_map), compress)
     listing.files.add(file_type=map_files.FileKind.MISSIONS, path=map_files.MISSIONS)
-    partition = taken.partition if taken else Partition()
+    partition = taken.partition if taken else tables_to_messages.Partition()
     for content in tables_to_messages.contents(vi_map, partition):
         check_cancelled()
         progress.step(len(listing.files), len(vi_map.vertices) // 50 + 4, "write files")

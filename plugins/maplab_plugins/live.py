@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from maplab_py.cancellation import ending_early
-from maplab_py.interop.live.bag_recording import RecordingOptions
+from maplab_py.interop.live import bag_recording, playing
 from maplab_py.interop.live.options import LiveOptions, NetworkOptions
-from maplab_py.interop.live.playing import PlayingOptions
 from maplab_py.interop.recordings.options import SourceOptions
 from maplab_py.plugin import CommandContext, command
 
@@ -65,7 +64,7 @@ def play_recording(
     *,
     source: SourceOptions = SourceOptions(),
     network: NetworkOptions = NetworkOptions(),
-    options: PlayingOptions = PlayingOptions(),
+    options: playing.PlayingOptions = playing.PlayingOptions(),
 ) -> PlayedRecording:
     """Publish images and IMU samples of a recording as topics of ROS 2, ROS 1 or Foxglove.
 
@@ -99,7 +98,7 @@ def record_bag(
     bag: Path,
     *,
     network: NetworkOptions = NetworkOptions(),
-    options: RecordingOptions = RecordingOptions(),
+    options: bag_recording.RecordingOptions = bag_recording.RecordingOptions(),
     live_silence_s: float = _LIVE.silence_s,
     overwrite: bool = False,
 ) -> RecordedBag:

@@ -8,9 +8,8 @@ import numpy as np
 from maplab_py.algorithms.pose_graph_manipulation.layout import LayoutOptions
 from maplab_py.plugin import CommandContext, Message, UserError, command
 from maplab_py.report import counted
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import VIMap, queries
 from maplab_py.vimap.ids import to_hex
-from maplab_py.vimap.queries import mission_distances_m, mission_labels, mission_time_spans_ns
 
 
 @command("remove_mission", "rm", example="remove_mission --map_mission=59f0 --yes")
@@ -29,7 +28,7 @@ def remove_mission(
     rows = context.mission_rows(map_mission, map_mission_list)
     if rows is None:
         raise UserError("remove_mission: no mission is given; use --map_mission=<id or prefix>")
-    labels = mission_labels(context.vi_map)
+    labels = queries.mission_labels(context.vi_map)
     ids = ", ".join(labels[row] for row in rows)
     context.confirm(f"remove mission {ids}?", yes=yes)
     context.commit(remove_missions(context.vi_map, rows))
@@ -64,7 +63,7 @@ def remove_mission_interactive(context: CommandContext, *, map_mission_list: str
     removed = _missions_to_remove(context, asked.tolist())
     if not removed:
         return Message("no mission is removed")
-    labels = mission_labels(vi_map)
+    labels = queries.mission_labels(vi_map)
     context.commit(remove_missions(vi_map, np.array(removed)))
     names = ", ".join(labels[row] for row in removed)
     return Message(f"removed {counted(len(removed), 'mission')}: {names}")
@@ -72,7 +71,7 @@ def remove_mission_interactive(context: CommandContext, *, map_mission_list: str
 
 def _missions_to_remove(context: CommandContext, rows: list[int]) -> list[int]:
     """Ask about each mission (row) and return those to remove."""
-    labels, facts = mission_labels(context.vi_map), _mission_facts(context.vi_map)
+    labels, facts = queries.mission_labels(context.vi_map), _mission_facts(context.vi_map)
     removed: list[int] = []
     with _shown_alone(context) as show_mission:
         for place, row in enumerate(rows, start=1):
@@ -90,8 +89,8 @@ def _missions_to_remove(context: CommandContext, rows: list[int]) -> list[int]:
 
 def _mission_facts(vi_map: VIMap) -> list[str]:
     """Return name, id, length, duration and size of each mission as a line."""
-    length_m = mission_distances_m(vi_map)
-    duration_s = 1e-9 * np.diff(mission_time_spans_ns(vi_map), axis=1)[:, 0]
+    length_m = queries.mission_distances_m(vi_map)
+    duration_s = 1e-9 * np.diff(queries.mission_time_spans_ns(vi_map), axis=1)[:, 0]
     vertices = np.diff(vi_map.vertex_start)
     return [
         f"{name or 'without a name'}, id {to_hex(vi_map.missions.id[row])}, {length_m[row]:.1f} m, "
@@ -151,7 +150,7 @@ def rename_mission(context: CommandContext, name: str, *, map_mission: str = "")
         )
     if name in names[:row] + names[row + 1 :]:
         raise UserError(f"rename_mission: another mission is named '{name}'; choose another name")
-    old = mission_labels(vi_map)[row]
+    old = queries.mission_labels(vi_map)[row]
     names[row] = name
     context.commit(named(vi_map, names))
     return Message(f"renamed mission '{old}' to '{name}'")

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from maplab_py.algorithms.dense import fusion, grid
-from maplab_py.algorithms.dense.options import MESH_MIN_WEIGHT
+from maplab_py.algorithms.dense import fusion, grid, options
 from maplab_py.algorithms.dense.resources import DEPTH_MAPS, FrameImages, FrameResources
 from maplab_py.array_types import F32, F64, I64, U8
 from maplab_py.errors import EstimationError, UserError
@@ -32,7 +31,7 @@ def map_mesh(
     vi_map: VIMap,
     map_folder: Path,
     missions: I64 | None = None,
-    min_weight: float = MESH_MIN_WEIGHT,
+    min_weight: float = options.MESH_MIN_WEIGHT,
 ) -> tuple[grid.Mesh, int]:
     """Return the surface of the grids of missions in G, and the number of grids.
 
@@ -65,7 +64,7 @@ def write_map_mesh(
     map_folder: Path,
     file: Path,
     missions: I64 | None = None,
-    min_weight: float = MESH_MIN_WEIGHT,
+    min_weight: float = options.MESH_MIN_WEIGHT,
     *,
     with_colours: bool = False,
     overwrite: bool = False,

@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 
 from maplab_py.algorithms.gate import Gate, any_failed, failures
+from maplab_py.algorithms.loop_closure import listing, record_updates
 from maplab_py.algorithms.loop_closure.closure_record import ClosureRecord, read_record
 from maplab_py.algorithms.loop_closure.closure_table import VERDICTS, GateValues
 from maplab_py.algorithms.loop_closure.detection import detect
 from maplab_py.algorithms.loop_closure.gates import closure_gates, judge
-from maplab_py.algorithms.loop_closure.listing import describe_closure
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.algorithms.loop_closure.record_updates import with_closures
 from maplab_py.algorithms.loop_closure.reports import OF_CLOUDS, Verdict
 from maplab_py.array_types import I64, Mask
 from maplab_py.geometry import se3
@@ -110,7 +109,7 @@ class PairLine:
 def explain_closure(vi_map: VIMap, row: int, options: LoopClosureOptions) -> ClosureExplanation:
     """Return the gates of a recorded closure (a row of the closures of `read_record`)."""
     closures = read_record(vi_map).closures
-    line = describe_closure(vi_map, row)
+    line = listing.describe_closure(vi_map, row)
     gates = closure_gates(closures, options)
     lines = [
         GateLine(gate.name, *gate.describe(row), gate.flag) for gate in gates if gate.applies[row]
@@ -164,7 +163,7 @@ def explain_pair(
         detection = detect(
             vi_map, options, missions=rows, only_other_missions=True, progress=progress
         )
-        vi_map = with_closures(vi_map, detection.closures, "")
+        vi_map = record_updates.with_closures(vi_map, detection.closures, "")
         recorded, origin = read_record(vi_map).closures, "found by a search that changed nothing"
         chosen = _between(vi_map, recorded, first, second)
         if not chosen.any():

@@ -16,8 +16,7 @@ from maplab_py.algorithms.loop_closure.reports import GAP, UNKNOWN_BASE_FRAME
 from maplab_py.array_types import F64, I64, Mask, NDArray
 from maplab_py.distinct import distinct
 from maplab_py.geometry import se3, so3
-from maplab_py.vimap import VIMap, observer_counts, ragged_rows, starts_of_counts
-from maplab_py.vimap.edits import merge_landmarks, with_p_G
+from maplab_py.vimap import VIMap, edits, observer_counts, ragged_rows, starts_of_counts
 from maplab_py.vision.point_covariance import ClosurePoses, LandmarkPairs, squared_sigmas
 from maplab_py.vision.track_union import unite_tracks
 
@@ -115,7 +114,7 @@ def _merge(
     counts = {FEW_OBSERVATIONS: united.too_few, SAME_IMAGE: united.seen_together}
     refused |= {reason: count for reason, count in counts.items() if count}
     absorbed, survivor = _into_best(vi_map, united.first, united.second)
-    merged = merge_landmarks(with_inherited(vi_map, absorbed, survivor), absorbed, survivor)
+    merged = edits.merge_landmarks(with_inherited(vi_map, absorbed, survivor), absorbed, survivor)
     ids = vi_map.landmarks.id[np.unique(survivor)]
     return _triangulate(merged, merged.landmark_index.rows(ids)), MergeResult(
         landmarks_merged=len(vi_map.landmarks) - len(merged.landmarks),
@@ -134,9 +133,9 @@ def _triangulate(vi_map: VIMap, landmarks: I64) -> VIMap:
     start = starts_of_counts(np.diff(vi_map.observation_start)[landmarks])
     p_G, _, is_usable = triangulate_keypoints(vi_map, keypoints, start)
     landmarks, p_G = landmarks[is_usable], p_G[is_usable]
-    moved = with_p_G(vi_map, landmarks, p_G)
+    moved = edits.with_p_G(vi_map, landmarks, p_G)
     better = predicted_sigma(moved, landmarks) < predicted_sigma(vi_map, landmarks)
-    return with_p_G(vi_map, landmarks[better], p_G[better])
+    return edits.with_p_G(vi_map, landmarks[better], p_G[better])
 
 
 def _into_best(vi_map: VIMap, first: I64, second: I64) -> tuple[I64, I64]:

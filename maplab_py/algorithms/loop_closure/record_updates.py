@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.algorithms.loop_closure import closure_table
+from maplab_py.algorithms.loop_closure import closure_table, consensus, merging
 from maplab_py.algorithms.loop_closure.closure_record import (
     USES,
     ClosureRecord,
@@ -15,16 +15,13 @@ from maplab_py.algorithms.loop_closure.closure_record import (
     read_record,
     write_record,
 )
-from maplab_py.algorithms.loop_closure.consensus import path_lengths
-from maplab_py.algorithms.loop_closure.merging import MergeResult
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.reports import ClosureRemovalReport, Verdict
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.distinct import distinct
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3
-from maplab_py.vimap import IdArray, IdIndex, LoopClosureEdges, VIMap, to_hex_list
-from maplab_py.vimap.edits import add_landmarks, remove_loop_closure_edges, with_p_G
+from maplab_py.vimap import IdArray, IdIndex, LoopClosureEdges, VIMap, edits, to_hex_list
 
 REMOVED = closure_table.VERDICTS.index(Verdict.REMOVED)
 _BAN_REACH_M = 2.0
@@ -37,7 +34,7 @@ def banned(vi_map: VIMap, query_vertex: I64, place_vertex: I64) -> Mask:
     closures = closures.take(closures.verdict == REMOVED)
     result = np.zeros(len(query_vertex), dtype=np.bool_)
     a, b = (vi_map.vertex_index.rows(ids) for ids in (closures.query, closures.place))
-    way, mission = path_lengths(vi_map), vi_map.vertices.mission
+    way, mission = consensus.path_lengths(vi_map), vi_map.vertices.mission
     for from_, to in ((a, b), (b, a)):
         order = np.argsort(from_, kind="stable")
         first = np.searchsorted(from_[order], query_vertex, "left")
@@ -57,7 +54,7 @@ def with_closures(
     *,
     used: Mask | None = None,
     weight: F64 | None = None,
-    merges: MergeResult | None = None,
+    merges: merging.MergeResult | None = None,
     before: VIMap | None = None,
 ) -> VIMap:
     """Write the closures of one search into the map's record.
@@ -113,7 +110,7 @@ def _closure_rows(
 
 
 def _with_merges(
-    record: LoopRecord, before: VIMap, closures: closure_table.Closures, merges: MergeResult
+    record: LoopRecord, before: VIMap, closures: closure_table.Closures, merges: merging.MergeResult
 ) -> LoopRecord:
     """Append the pairs, the landmarks before merging, and the keypoints that observed them."""
     lm = before.landmarks
@@ -166,7 +163,7 @@ def remove_closures(vi_map: VIMap, ids: IdArray) -> tuple[VIMap, ClosureRemovalR
         verdict=verdict, use=np.where(removed, 0, record.closures.use)
     )
     edges = IdIndex(ids).rows(vi_map.loop_closure_edges.id) >= 0
-    result = remove_loop_closure_edges(vi_map, edges) if edges.any() else vi_map
+    result = edits.remove_loop_closure_edges(vi_map, edges) if edges.any() else vi_map
     pairs = record.pairs.take(IdIndex(ids).rows(record.pairs.closure) < 0)
     result, restored, moved, pairs = _restore(result, record, _still_wanted(pairs, record.closures))
     result = write_record(result, dataclasses.replace(record, closures=closures, pairs=pairs))
@@ -271,7 +268,7 @@ def _restore(
     survivor_group = np.full(len(vi_map.landmarks) + 1, -1, dtype=np.int64)
     survivor_group[present[present >= 0]] = united[present >= 0]
     moves = (target >= 0) & (now >= 0) & (survivor_group[now] == united[original])
-    result = add_landmarks(
+    result = edits.add_landmarks(
         vi_map,
         vertex=vertex[back],
         p_I=lm.p_I[back],
@@ -298,7 +295,7 @@ def _as_before(vi_map: VIMap, recorded: MergedLandmarks, rows: I64, vertex: I64)
     """
     landmarks = vi_map.landmark_index.rows(recorded.id[rows])
     p_G = se3.transform(vi_map.T_G_I[vertex], recorded.p_I[rows])
-    moved = with_p_G(vi_map, landmarks, p_G)
+    moved = edits.with_p_G(vi_map, landmarks, p_G)
     stored_there = moved.landmarks.vertex[landmarks] == vertex
     p_I, quality = np.array(moved.landmarks.p_I), np.array(moved.landmarks.quality)
     p_I[landmarks[stored_there]] = recorded.p_I[rows[stored_there]]

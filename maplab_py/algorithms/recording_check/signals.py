@@ -12,8 +12,7 @@ from maplab_py.algorithms.recording_check import image_samples
 from maplab_py.algorithms.recording_check.stereo import StereoSampler
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import MapError
-from maplab_py.interop.recordings import clocks, protocol
-from maplab_py.interop.recordings.options import StreamOptions
+from maplab_py.interop.recordings import clocks, options, protocol
 from maplab_py.interop.recordings.stream import Synchroniser
 from maplab_py.progress import SILENT, Progress
 
@@ -78,7 +77,7 @@ class Signals:
 
 def read_signals(
     recording: protocol.Recording,
-    stream: StreamOptions | None = None,
+    stream: options.StreamOptions | None = None,
     *,
     first_s: float = 0.0,
     progress: Progress = SILENT,
@@ -93,7 +92,7 @@ def read_signals(
     Raises:
         MapError: A table of it is damaged.
     """
-    stream = stream or StreamOptions()
+    stream = stream or options.StreamOptions()
     start_ns = recording.start_ns + round(stream.start_s * 1e9)
     end_ns = recording.start_ns + round(stream.end_s * 1e9) if stream.end_s else None
     reader = _Reader(recording.device, start_ns, stream.nframe_sync_tolerance_ns)

@@ -13,8 +13,7 @@ from maplab_py.array_types import F64, Mask
 from maplab_py.estimation.kernels.loss import loss_and_weight
 from maplab_py.estimation.linear.threads import single_blas_thread
 from maplab_py.estimation.loss import Loss
-from maplab_py.estimation.problem import pose_graph, trust_region
-from maplab_py.estimation.problem.solver import SLOW_CONVERGENCE, SolverOptions, optimize_states
+from maplab_py.estimation.problem import pose_graph, solver, trust_region
 from maplab_py.estimation.terms.pose_graph import RelativePoses, TiltPriors
 from maplab_py.geometry import symmetric
 from maplab_py.progress import Progress
@@ -32,7 +31,7 @@ the linear switch function) is Geman and McClure's loss: s = phi / (phi + u)."""
 _PENALTY_RATIO = 4.0  # from one stage to the next
 _STAGE_ITERATIONS = 4
 _STAGE_TOLERANCE = 1e-7
-_SOLVER = SolverOptions(
+_SOLVER = solver.SolverOptions(
     initial_radius=1e8,
     min_radius=1e-8,
     max_radius=1e12,
@@ -252,9 +251,9 @@ class _Graph:
             forecast_tolerance=tolerance,
             slow_ratio=_SLOW_RATIO if problem.can_have_second_order else 1.0,
         )
-        T, summary = optimize_states(problem, T, options, self.progress)
+        T, summary = solver.optimize_states(problem, T, options, self.progress)
         iterations = summary.iterations - summary.rejected_steps
-        if summary.termination != SLOW_CONVERGENCE:
+        if summary.termination != solver.SLOW_CONVERGENCE:
             return T, iterations
         problem.set_second_order(True)
         rest = dataclasses.replace(
@@ -264,7 +263,7 @@ class _Graph:
             schedule=trust_region.Schedule.CERES,
             slow_ratio=1.0,
         )
-        T, newton = optimize_states(problem, T, rest, self.progress)
+        T, newton = solver.optimize_states(problem, T, rest, self.progress)
         return T, iterations + newton.iterations - newton.rejected_steps
 
     def _solution(self, T: F64, weight: F64, iterations: int) -> Solution:

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from maplab_py.algorithms.self_calibration import device, reports
 from maplab_py.algorithms.self_calibration.calibration import calibrate
-from maplab_py.algorithms.self_calibration.device import transfer_calibration
 from maplab_py.algorithms.self_calibration.estimation import imu_interpolation
 from maplab_py.algorithms.self_calibration.estimation.parameters import Parameters
 from maplab_py.algorithms.self_calibration.estimation.problem import build_segment_problem
@@ -17,7 +17,6 @@ from maplab_py.algorithms.self_calibration.estimation.solution import (
     solve_rejecting_outliers,
 )
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
-from maplab_py.algorithms.self_calibration.reports import PrunedSegment, PruneReport
 from maplab_py.algorithms.self_calibration.segments.database import SegmentDatabase
 from maplab_py.algorithms.self_calibration.uncertainty import (
     LANDMARK_DAMPING,
@@ -47,7 +46,7 @@ def prune(
     probability: float = PROBABILITY,
     capacity: int = 0,
     progress: Progress = SILENT,
-) -> tuple[SegmentDatabase, PruneReport]:
+) -> tuple[SegmentDatabase, reports.PruneReport]:
     """Remove segments of some missions, then outdated ones, then those beyond a capacity.
 
     Args:
@@ -81,7 +80,7 @@ def prune(
     if capacity:
         result = result.pruned(capacity)
     rows = (
-        PrunedSegment(
+        reports.PrunedSegment(
             mission=record.mission[:8],
             first_vertex=record.first_vertex[:8],
             distance=test.distance,
@@ -91,7 +90,7 @@ def prune(
         )
         for record, test in zip(tested.records if tests else (), tests, strict=True)
     )
-    return result, PruneReport(len(database), len(result), tuple(rows))
+    return result, reports.PruneReport(len(database), len(result), tuple(rows))
 
 
 def test_mutual_consistency(
@@ -141,7 +140,7 @@ def test_segments(
     tests = []
     for number, record in enumerate(database.records):
         progress.step(number, len(database), "test segments")
-        segment = transfer_calibration(database.map_of(record), sensors)
+        segment = device.transfer_calibration(database.map_of(record), sensors)
         tests.append(test_segment(segment, options, probability))
     return tests
 

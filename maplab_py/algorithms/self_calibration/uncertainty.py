@@ -12,8 +12,7 @@ from maplab_py.algorithms.self_calibration.estimation.parameters import Paramete
 from maplab_py.algorithms.self_calibration.estimation.problem import SegmentProblem
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import EstimationError
-from maplab_py.estimation.linear.protocol import NotPositiveDefinite
-from maplab_py.estimation.linear.threads import single_blas_thread
+from maplab_py.estimation.linear import protocol, threads
 from maplab_py.estimation.problem.problem import Linearization
 from maplab_py.estimation.states import States
 
@@ -35,7 +34,7 @@ def posterior_covariance(problem: SegmentProblem, states: States) -> F64:
         EstimationError: The normal equations are singular in spite of the priors.
     """
     inner = problem.problem
-    with single_blas_thread():
+    with threads.single_blas_thread():
         inner.relinearize(states)
         _factorise(problem, inner.linearize(states, LANDMARK_DAMPING), states)
         node, direction = problem.parameters.nodes(states)
@@ -51,7 +50,7 @@ def _factorise(problem: SegmentProblem, linear: Linearization, states: States) -
     for damping in _DAMPINGS:
         try:
             inner.factorise(linear, damping)
-        except NotPositiveDefinite as error:
+        except protocol.NotPositiveDefinite as error:
             failed = error.node
         else:
             return
@@ -77,7 +76,7 @@ def spectrum(covariance: F64, parameters: Parameters) -> Spectrum:
     half of the prior's variance. This is the truncation of a rank-revealing decomposition.
     """
     scale = parameters.prior_sigma
-    with single_blas_thread():
+    with threads.single_blas_thread():
         share, directions = np.linalg.eigh(covariance / np.outer(scale, scale))
     return Spectrum(directions, np.clip(share, 0.0, 1.0))
 

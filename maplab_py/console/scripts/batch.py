@@ -8,8 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from maplab_py.console.commands.flag_types import expand_path
-from maplab_py.console.commands.lines import escaped
+from maplab_py.console.commands import flag_types, lines
 from maplab_py.console.scripts.checking import check_commands
 from maplab_py.console.scripts.runner import Runner
 from maplab_py.console.session.status import Status
@@ -89,7 +88,7 @@ def _matching(pattern: str, path: Path) -> list[str]:
         UserError: A variable is not set, or the wildcards match nothing.
     """
     try:
-        text = str(expand_path(pattern))
+        text = str(flag_types.expand_path(pattern))
     except ValueError as error:
         raise UserError(f"{path}: vi_map_folder_paths: {error}") from None
     if not any(character in text for character in "*?["):
@@ -117,7 +116,7 @@ def run_batch(
         The status of the first failure.
     """
     commands = "\n".join(batch.commands)
-    texts = [commands.replace(FOLDER_TEMPLATE, escaped(folder)) for folder in batch.folders]
+    texts = [commands.replace(FOLDER_TEMPLATE, lines.escaped(folder)) for folder in batch.folders]
     if not keep_going:
         runner, written = make_runner(), list[Path]()
         checked = [check_commands(text, runner.session, written) for text in texts]

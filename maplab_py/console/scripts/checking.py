@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from maplab_py.console.commands.flags import normalise
-from maplab_py.console.commands.lines import TypedCommand, typed_commands, variable_lookup
+from maplab_py.console.commands import flags, lines
 from maplab_py.console.scripts.aliases import expanded
 from maplab_py.console.session.call import Call, call_from_words
 from maplab_py.console.session.session import Session
@@ -57,7 +56,7 @@ class _Checker:
     def check(self, text: str, place: str = "", depth: int = 0) -> None:
         """Check the commands of a text; `place` is that of the alias that it stands for."""
         try:
-            commands = typed_commands(text)
+            commands = lines.typed_commands(text)
         except UserError as error:
             self.problems.append(_placed(str(error), place))
             return
@@ -72,9 +71,9 @@ class _Checker:
                 self.problems.append(_placed(str(error), where))
             position += len(command.source)
 
-    def _check_command(self, typed: TypedCommand, place: str, depth: int) -> bool:
+    def _check_command(self, typed: lines.TypedCommand, place: str, depth: int) -> bool:
         """Check one command; return whether it ends the chain."""
-        (command,) = typed_commands(typed.source, variable_lookup(self._variables))
+        (command,) = lines.typed_commands(typed.source, lines.variable_lookup(self._variables))
         if command.assignment is not None:
             self._variables.update([command.assignment])
             return False
@@ -114,7 +113,7 @@ class _Checker:
             self._settings.assign(words, Layer.SET, "set")
         elif name == "unset":
             for word in words:
-                self._settings.unset(normalise(word.lstrip("-")))
+                self._settings.unset(flags.normalise(word.lstrip("-")))
         elif name == "alias" and words:
             alias, _, text = words[0].partition("=")
             self._aliases[alias] = text

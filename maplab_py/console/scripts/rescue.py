@@ -10,8 +10,7 @@ import weakref
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from maplab_py.console.session.maps import MapManager
-from maplab_py.console.session.paths import state_folder
+from maplab_py.console.session import maps, paths
 from maplab_py.console.session.session import Session
 from maplab_py.console.terminal.protocol import SilentTerminal
 
@@ -25,7 +24,7 @@ MOST_RUNS = 5
 
 def rescue_folder() -> Path:
     """Return the folder with one sub-folder per script that left maps unsaved."""
-    return state_folder() / "rescued"
+    return paths.state_folder() / "rescued"
 
 
 def rescued_runs() -> list[Path]:
@@ -67,7 +66,7 @@ class Rescue:
             del self._copies[key]
             shutil.rmtree(self._folder / key, ignore_errors=True)
         draft = copy.copy(self._session)
-        draft.maps, draft.terminal = MapManager(draft.maps.state), SilentTerminal()
+        draft.maps, draft.terminal = maps.MapManager(draft.maps.state), SilentTerminal()
         for key, entry in unsaved.items():
             if key in self._copies and self._copies[key]() is entry.vi_map:
                 continue

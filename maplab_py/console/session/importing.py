@@ -11,8 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from maplab_py.console.commands.command import COMMAND_ATTRIBUTE, describe
-from maplab_py.console.commands.flag_types import flag_type
+from maplab_py.console.commands import command, flag_types
 from maplab_py.console.commands.flags import Flag
 from maplab_py.console.session.context import CommandContext
 from maplab_py.console.session.maps import key_of_folder
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
     from maplab_py.vimap import VIMap
 
 _MAP_KEY = Flag(
-    "map_key", flag_type(str), "", "Name of the map in memory; empty = the path's name",
+    "map_key", flag_types.flag_type(str), "", "Name of the map in memory; empty = the path's name",
     path=("map_key",),
 )  # fmt: skip
 
@@ -62,7 +61,7 @@ def importer(
     """
 
     def decorate(function: ReaderT) -> ReaderT:
-        described = describe(
+        described = command.describe(
             _command_of(function),
             name,
             aliases,
@@ -73,7 +72,7 @@ def importer(
         if _MAP_KEY.name in described.flags:
             raise TypeError(f"command {name}: flag --{_MAP_KEY.name} is defined twice")
         flags = types.MappingProxyType({**described.flags, _MAP_KEY.name: _MAP_KEY})
-        setattr(function, COMMAND_ATTRIBUTE, dataclasses.replace(described, flags=flags))
+        setattr(function, command.COMMAND_ATTRIBUTE, dataclasses.replace(described, flags=flags))
         return function
 
     return decorate

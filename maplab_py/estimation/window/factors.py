@@ -10,8 +10,7 @@ import numpy as np
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.estimation.kernels import window as kernels
 from maplab_py.estimation.kernels.window_arguments import FRAME_SIZE, DenseSystem
-from maplab_py.estimation.window.inertial import InertialChain
-from maplab_py.estimation.window.options import StandstillSigmas
+from maplab_py.estimation.window import inertial, options
 from maplab_py.estimation.window.states import WindowStates
 from maplab_py.geometry import se3
 
@@ -31,7 +30,7 @@ EVERY = Part(slice(None), slice(None))
 class FrameFactors:
     """Inertial edges, walk of the biases, and what is known of frames at rest."""
 
-    chain: InertialChain
+    chain: inertial.InertialChain
     standstill: Standstill
     is_resting: Mask  # (F,) frames surely without velocity
     is_turning: Mask  # (F,) frames that only turn, which is less sure
@@ -104,7 +103,7 @@ class Standstill:
     zero against gravity and bias, and no turn that the mean angular velocity is the bias.
     """
 
-    def __init__(self, kernel: ModuleType, sigmas: StandstillSigmas) -> None:
+    def __init__(self, kernel: ModuleType, sigmas: options.StandstillSigmas) -> None:
         """Take the kernel of the residual `relative_pose`."""
         self._kernel, self._sigmas = kernel, sigmas
         weights = np.repeat([1.0 / sigmas.position_m, 1.0 / sigmas.rotation_rad], 3)

@@ -9,8 +9,7 @@ import numpy as np
 from maplab_py.array_types import F64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3
-from maplab_py.interop.calibrations import kalibr, models
-from maplab_py.interop.calibrations.parts import Parts, note_unknown_keys
+from maplab_py.interop.calibrations import kalibr, models, parts
 from maplab_py.sensors import Camera, Imu, yaml_entry
 
 _UNIT_TOLERANCE = 1e-3
@@ -35,7 +34,7 @@ _TERMS = {
 """Projection, distortion, and the names of their parameters by Basalt's names of models."""
 
 
-def read_basalt(top: yaml_entry.Entry) -> Parts:
+def read_basalt(top: yaml_entry.Entry) -> parts.Parts:
     """Read a calibration of Basalt; biases, the vignette and poses of markers are not used.
 
     Raises:
@@ -63,8 +62,8 @@ def read_basalt(top: yaml_entry.Entry) -> Parts:
     ]
     imu, T_I_i = _imu(entry)
     T_i_C = np.stack([_pose(part) for part in poses])
-    notes = note_unknown_keys(top, _NOT_OF_THE_CALIBRATION)
-    return Parts("Basalt", cameras, T_i_C, imu, se3.inverse(T_I_i), notes=notes)
+    notes = parts.note_unknown_keys(top, _NOT_OF_THE_CALIBRATION)
+    return parts.Parts("Basalt", cameras, T_i_C, imu, se3.inverse(T_I_i), notes=notes)
 
 
 def _pose(entry: yaml_entry.Entry) -> F64:

@@ -12,8 +12,7 @@ import numpy as np
 from maplab_py.array_types import F64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
-from maplab_py.interop.calibrations import models
-from maplab_py.interop.calibrations.parts import Parts, note_unknown_keys, read_entry
+from maplab_py.interop.calibrations import models, parts
 from maplab_py.sensors import Camera, Imu, yaml_entry
 
 _MAX_CAMERAS = 16
@@ -35,7 +34,7 @@ def is_vins(entry: yaml_entry.Entry) -> bool:
     return any(key in entry for key in keys) or ("acc_n" in entry and "gyr_n" in entry)
 
 
-def read_vins(entry: yaml_entry.Entry, folder: Path) -> Parts:
+def read_vins(entry: yaml_entry.Entry, folder: Path) -> parts.Parts:
     """Return cameras and IMU of the settings.
 
     Args:
@@ -53,7 +52,7 @@ def read_vins(entry: yaml_entry.Entry, folder: Path) -> Parts:
         if not 1 <= count <= _MAX_CAMERAS:
             raise MapError(f"{entry.where}: key 'num_of_cam' must be from 1 to {_MAX_CAMERAS}")
         files = [folder / str(entry.raw(f"cam{row}_calib")) for row in range(count)]
-        cameras = [_camera(read_entry(path)) for path in files]
+        cameras = [_camera(parts.read_entry(path)) for path in files]
         poses = [_pose(entry, f"body_T_cam{row}") for row in range(count)]
         notes += _compare_sizes(entry, cameras)
     shift_ns = models.read_time_shift_ns(entry, "td")
@@ -77,8 +76,8 @@ def read_vins(entry: yaml_entry.Entry, folder: Path) -> Parts:
     if missing and imu is not None:
         raise MapError(f"{why}: let VINS estimate it first, or calibrate with kalibr")
     T_B_C = np.stack([se3.identity() if pose is None else pose for pose in poses])
-    notes += models.note_line_delays(entry, cameras) + note_unknown_keys(entry, settings=True)
-    return Parts("VINS", cameras, T_B_C, imu, why_not_on_imu=why, notes=notes)
+    notes += models.note_line_delays(entry, cameras) + parts.note_unknown_keys(entry, settings=True)
+    return parts.Parts("VINS", cameras, T_B_C, imu, why_not_on_imu=why, notes=notes)
 
 
 def _camera(entry: yaml_entry.Entry) -> Camera:

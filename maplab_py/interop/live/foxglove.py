@@ -14,8 +14,7 @@ from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
 from maplab_py.errors import UserError
-from maplab_py.interop.live import transport
-from maplab_py.interop.live.options import NetworkOptions
+from maplab_py.interop.live import options, transport
 from maplab_py.interop.recordings.bag_files import message_types
 
 SUBPROTOCOLS: Any = ("foxglove.sdk.v1", "foxglove.websocket.v1")
@@ -41,7 +40,7 @@ class _Channel(NamedTuple):
 class FoxgloveClient:
     """A connection to a server, made again when it breaks."""
 
-    def __init__(self, network: NetworkOptions) -> None:
+    def __init__(self, network: options.NetworkOptions) -> None:
         """Connect.
 
         Raises:
@@ -259,7 +258,7 @@ class FoxgloveServer:
 
     is_ros_2 = True
 
-    def __init__(self, network: NetworkOptions) -> None:
+    def __init__(self, network: options.NetworkOptions) -> None:
         """Listen at the port of `foxglove_url`.
 
         Raises:

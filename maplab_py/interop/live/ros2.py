@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from maplab_py.errors import UserError
-from maplab_py.interop.live import transport
-from maplab_py.interop.live.options import NetworkOptions
+from maplab_py.interop.live import options, transport
 from maplab_py.interop.recordings.bag_files import message_types
 
 # ROS's `sensor_msgs/msg/Image` is the type `sensor_msgs::msg::dds_::Image_` of DDS: the module `dds_`
@@ -111,7 +110,7 @@ class Ros2:
 
     is_ros_2 = True
 
-    def __init__(self, network: NetworkOptions) -> None:
+    def __init__(self, network: options.NetworkOptions) -> None:
         """Join a domain.
 
         Raises:
@@ -284,7 +283,7 @@ def _quality(kind: str, *, is_reliable: bool) -> Any:
     )
 
 
-def _configuration(network: NetworkOptions) -> str:
+def _configuration(network: options.NetworkOptions) -> str:
     """Return Cyclone's configuration; the user's own (CYCLONEDDS_URI) is read after it and wins."""
     address = transport.listening_address(network)
     is_local = address == transport.LOOPBACK

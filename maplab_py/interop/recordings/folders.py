@@ -20,16 +20,15 @@ from maplab_py.errors import MapError, MaplabError
 from maplab_py.input_files import read_foreign_text
 from maplab_py.interop.images import CONTAINER_BITS, sampled
 from maplab_py.interop.imu_csv import read_imu_csv
-from maplab_py.interop.recordings import clocks, protocol
+from maplab_py.interop.recordings import clocks, options, protocol
 from maplab_py.interop.recordings.images import bits_note, camera_bits, image_file
-from maplab_py.interop.recordings.options import ReadingOptions
 from maplab_py.interop.stamps import IMAGES, parse_stamps
 from maplab_py.interop.text_table import is_time_name
 from maplab_py.sensors import Camera
 
 _MAX_BYTES = 500_000_000
 _LARGEST_BATCH = 1000
-_DEFAULT = ReadingOptions()
+_DEFAULT = options.ReadingOptions()
 _MOST_LINES = 10
 _IMAGE_NAME = re.compile(r"\.[a-z]{2,5}$", re.IGNORECASE)
 
@@ -52,7 +51,7 @@ class FolderRecording:
         root: Path,
         device: protocol.RecordedSensors,
         camera_folders: tuple[int, ...] = (),
-        reading: ReadingOptions = _DEFAULT,
+        reading: options.ReadingOptions = _DEFAULT,
     ) -> None:
         """Open a recording.
 
@@ -347,7 +346,7 @@ class _Table:
 class _ImuTable(_Table):
     """IMU samples of a folder."""
 
-    def __init__(self, path: Path, reading: ReadingOptions) -> None:
+    def __init__(self, path: Path, reading: options.ReadingOptions) -> None:
         if not path.exists():
             raise MapError(
                 f"{path}: the table is missing: copy the folder again, or give a calibration "
@@ -366,7 +365,7 @@ class _ImageTable(_Table):
         missing: Files that are not there.
     """
 
-    def __init__(self, folder: Path, camera: Camera, reading: ReadingOptions) -> None:
+    def __init__(self, folder: Path, camera: Camera, reading: options.ReadingOptions) -> None:
         if not folder.is_dir():
             raise MapError(
                 f"{folder}: the folder is missing, although the calibration has this camera: choose "

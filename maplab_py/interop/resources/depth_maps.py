@@ -13,7 +13,6 @@ from maplab_py.array_types import F32, NDArray
 from maplab_py.errors import MapError, UserError
 from maplab_py.input_files import read_bytes
 from maplab_py.interop.resources import matching
-from maplab_py.interop.resources.matching import ImportedResources
 from maplab_py.options import Options, option
 from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors import Camera
@@ -44,7 +43,7 @@ def import_depth_maps(
     options: DepthImportOptions | None = None,
     *,
     progress: Progress = SILENT,
-) -> tuple[VIMap, ImportedResources]:
+) -> tuple[VIMap, matching.ImportedResources]:
     """Attach depth images (16-bit PNG, named by time stamp) to the frames of a camera.
 
     Depths must be along the optical axis, at the pixels of the camera's distorted image.
@@ -84,7 +83,7 @@ def import_depth_maps(
         new.add(RAW_DEPTH_MAPS, encoded_depth(depth_m))
     rows = np.arange(len(matched))
     attached = new.attached(vi_map, rows, wanted[matched]) if len(rows) else vi_map
-    return attached, ImportedResources(
+    return attached, matching.ImportedResources(
         to_hex(vi_map.missions.id[mission]),
         (resource_type(RAW_DEPTH_MAPS).name,),
         len(files),

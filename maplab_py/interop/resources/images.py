@@ -10,7 +10,6 @@ from maplab_py.interop.images import as_8_bits
 from maplab_py.interop.recordings import folders, protocol
 from maplab_py.interop.recordings.images import EncodedImage
 from maplab_py.interop.resources import matching
-from maplab_py.interop.resources.matching import ExportedImages, ImportedResources
 from maplab_py.options import Options, option
 from maplab_py.output_files import write_bytes, write_text
 from maplab_py.progress import SILENT, Progress
@@ -42,7 +41,7 @@ def import_images(
     options: ImageImportOptions | None = None,
     *,
     progress: Progress = SILENT,
-) -> tuple[VIMap, ImportedResources]:
+) -> tuple[VIMap, matching.ImportedResources]:
     """Attach the images of an EuRoC or TUM-VI folder to the frames of a mission (row).
 
     The k-th camera of the mission gets the images of the folder cam<k>. Frames that have an image
@@ -84,7 +83,7 @@ def import_images(
         )
     attached = new.attached(vi_map, rows, owners) if rows else vi_map
     kinds = sorted({resource_type(new.type_of(row)).name for row in rows})
-    report = ImportedResources(
+    report = matching.ImportedResources(
         to_hex(vi_map.missions.id[mission]), tuple(kinds), len(images), len(rows), skipped, without
     )
     return attached, report
@@ -112,7 +111,7 @@ def export_images(
     *,
     overwrite: bool = False,
     progress: Progress = SILENT,
-) -> ExportedImages:
+) -> matching.ExportedImages:
     """Write the images of a mission's frames as the folders cam0, cam1, ... of an EuRoC folder.
 
     Args:
@@ -150,7 +149,7 @@ def export_images(
             lines.append(f"{stamp},{stamp}.png\n")
             done += 1
         write_text(place / "data.csv", lines, overwrite=overwrite)
-    return ExportedImages(folder, done, len(np.unique(cameras)))
+    return matching.ExportedImages(folder, done, len(np.unique(cameras)))
 
 
 def encoded_png(image: Any) -> bytes:

@@ -17,8 +17,7 @@ from typing import Any
 
 from maplab_py.errors import MaplabError
 from maplab_py.kernel_cache import cache_root, check_trusted
-from maplab_py.storage.cache.column_file import UnusableColumns, read_columns, write_columns
-from maplab_py.storage.cache.options import CacheOptions
+from maplab_py.storage.cache import column_file, options
 from maplab_py.vimap import VIMap
 
 _SUFFIX = ".columns"
@@ -54,7 +53,7 @@ class MapCache:
     """Entries of one folder."""
 
     def __init__(
-        self, max_gb: float = CacheOptions().map_cache_max_gb, folder: Path | None = None
+        self, max_gb: float = options.CacheOptions().map_cache_max_gb, folder: Path | None = None
     ) -> None:
         """Use a folder, that of the user when none is given, up to a size."""
         self.folder = cache_root() / _FOLDER if folder is None else folder
@@ -71,8 +70,8 @@ class MapCache:
             return None, ""
         try:
             self._check(path)
-            vi_map, facts = read_columns(path, self._facts(listing))
-        except (UnusableColumns, MaplabError) as error:
+            vi_map, facts = column_file.read_columns(path, self._facts(listing))
+        except (column_file.UnusableColumns, MaplabError) as error:
             return None, f"the cached columns were not used: {error}"
         except (OSError, ValueError, KeyError) as error:
             return None, f"the cached columns were not used: {path} cannot be read ({error})"
@@ -99,7 +98,7 @@ class MapCache:
                     f"not kept in the cache: {self.folder} has {free / _GB:.2f} GB left, "
                     f"{needed / _GB:.2f} GB are needed"
                 )
-            write_columns(self._path(listing), vi_map, self._facts(listing) | facts)
+            column_file.write_columns(self._path(listing), vi_map, self._facts(listing) | facts)
         except OSError as error:
             return f"not kept in the cache: {self.folder} cannot be written ({error.strerror})"
         except MaplabError as error:

@@ -28,8 +28,7 @@ from maplab_py.estimation.problem.trust_region import Schedule
 from maplab_py.estimation.states import States
 from maplab_py.estimation.terms.inertial import BiasWalkTerm, InertialTerm
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.edits import with_p_G
+from maplab_py.vimap import VIMap, edits
 
 _INITIAL_ITERATIONS = 8
 """Iterations before all landmarks are triangulated and outliers judged a second time."""
@@ -146,7 +145,7 @@ def _retriangulated(
     vi_map = apply_states(problem, states, vi_options(options))
     rows = np.arange(len(vi_map.landmarks))
     p_G, _, good = triangulate_keypoints(vi_map, vi_map.observations, vi_map.observation_start)
-    return with_p_G(vi_map, rows[good], p_G[good])
+    return edits.with_p_G(vi_map, rows[good], p_G[good])
 
 
 def chi_square_per_freedom(problem: SegmentProblem, states: States) -> float:

@@ -22,10 +22,8 @@ from maplab_py.atomic.system import opened_locked
 from maplab_py.errors import MaplabError, UserError
 from maplab_py.input_files import DEFAULT_MAX_BYTES, RAISE_THE_BOUND, read_npz
 from maplab_py.output_files import write_bytes
-from maplab_py.sensors import SensorSet
-from maplab_py.sensors.sensors_yaml import parse_sensors, read_sensors, write_sensors
-from maplab_py.vimap import IdIndex, VIMap, from_hex, to_hex
-from maplab_py.vimap.merge import stack
+from maplab_py.sensors import SensorSet, sensors_yaml
+from maplab_py.vimap import IdIndex, VIMap, from_hex, merge, to_hex
 from maplab_py.vimap.selection import sorted_by_time
 from maplab_py.vimap.table import Table
 from maplab_py.vimap.tables import ImuSamples
@@ -127,7 +125,7 @@ class SegmentDatabase:
             return self
         added = extract_submap(vi_map, rows_of(vi_map, records))
         if len(self.vi_map.missions):
-            added = sorted_by_time(stack(self.vi_map, with_device_of(added, self.vi_map)))
+            added = sorted_by_time(merge.stack(self.vi_map, with_device_of(added, self.vi_map)))
         return dataclasses.replace(self, vi_map=added, records=(*self.records, *records))
 
     def missions_recorded_in(self, vi_map: VIMap) -> set[str]:
@@ -233,7 +231,7 @@ def save_database(database: SegmentDatabase, path: Path) -> None:
         "selection": database.selection,
         "parameter_names": list(database.parameter_names),
         "records": [dataclasses.asdict(record) for record in database.records],
-        "sensors": write_sensors(database.vi_map.sensors),
+        "sensors": sensors_yaml.write_sensors(database.vi_map.sensors),
     }
     arrays: dict[str, Any] = {"sigma_ref": database.sigma_ref}
     for name in _TABLES:
@@ -269,7 +267,7 @@ def load_database(path: Path, max_bytes: int = DEFAULT_MAX_BYTES) -> SegmentData
             )
         parts: dict[str, Any] = {name: _table(archive, name) for name in _TABLES}
         sigma_ref = archive["sigma_ref"]
-        sensors = parse_sensors(header["sensors"], str(path), max_bytes)
+        sensors = sensors_yaml.parse_sensors(header["sensors"], str(path), max_bytes)
         return SegmentDatabase(
             VIMap(sensors=sensors, **parts),
             tuple(
@@ -307,12 +305,12 @@ def read_calibration(path: Path, max_bytes: int = DEFAULT_MAX_BYTES) -> SensorSe
     """
     for file in (path / "vi_map" / "sensors.yaml", path / "sensors.yaml"):
         if path.is_dir() and file.is_file():
-            return read_sensors(file, max_bytes)
+            return sensors_yaml.read_sensors(file, max_bytes)
     if path.is_file() and path.suffix not in (".yaml", ".yml"):
         return load_database(path, max_bytes).vi_map.sensors
     if not path.is_file():
         raise UserError(f"{path}: there is no such calibration (sensors.yaml or map folder)")
-    return read_sensors(path, max_bytes)
+    return sensors_yaml.read_sensors(path, max_bytes)
 
 
 def _table(archive: Any, name: str) -> Table:

@@ -9,10 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from maplab_py.array_types import F32, F64, U8
-from maplab_py.vision.features.detection import strongest_places
-from maplab_py.vision.features.extension import ExtractedFeatures
-from maplab_py.vision.features.learned.networks import installed, open_network
-from maplab_py.vision.features.learned.xfeat_graph import CELL_PX, DIMENSIONS, SIZE_STEP_PX
+from maplab_py.vision.features import detection, extension
+from maplab_py.vision.features.learned import networks, xfeat_graph
 
 _APART_PX = 5.0
 _MIN_SHARE = 1e-3
@@ -27,7 +25,7 @@ def installed_xfeat() -> XFeat:
     Raises:
         UserError: It is not installed or damaged, or onnxruntime is missing.
     """
-    return installed("XFeat", XFeat)
+    return networks.installed("XFeat", XFeat)
 
 
 class XFeat:
@@ -43,23 +41,23 @@ class XFeat:
         Raises:
             UserError: onnxruntime cannot open it, or is not installed.
         """
-        self._session = open_network(network, name)
+        self._session = networks.open_network(network, name)
 
     def descriptor_map(self, image: U8 | F32) -> F32:
         """Return descriptors (H / 8, W / 8, 64) of an image (H, W) with sides of multiples of 32."""
         pixels = image[None, None].astype(np.float32)
         return np.asarray(self._session.run(["descriptors"], {"image": pixels})[0][0])
 
-    def extract(self, image: U8, max_features: int) -> ExtractedFeatures:
+    def extract(self, image: U8, max_features: int) -> extension.ExtractedFeatures:
         """Return the strongest corners of an image (H, W) with their descriptors, the strongest first."""
         uv_px = _corners(image, max_features)
         by_rank = np.arange(len(uv_px), 0.0, -1.0)
-        return ExtractedFeatures(uv_px, by_rank, self.describe(image, uv_px))
+        return extension.ExtractedFeatures(uv_px, by_rank, self.describe(image, uv_px))
 
     def describe(self, image: U8, uv_px: F64) -> F32:
         """Return the descriptors (K, 64) of keypoints (K, 2) of an image (H, W)."""
         if not len(uv_px):
-            return np.zeros((0, DIMENSIONS), dtype=np.float32)
+            return np.zeros((0, xfeat_graph.DIMENSIONS), dtype=np.float32)
         prepared, scale = _prepare(image)
         return _bicubic(
             self.descriptor_map(prepared), _cells((uv_px + 0.5) / scale - 0.5, prepared.shape)
@@ -71,7 +69,7 @@ def _prepare(image: U8) -> tuple[F32, F64]:
     import cv2
 
     size = np.array(image.shape[::-1])
-    wanted = np.maximum(size // SIZE_STEP_PX, 1) * SIZE_STEP_PX
+    wanted = np.maximum(size // xfeat_graph.SIZE_STEP_PX, 1) * xfeat_graph.SIZE_STEP_PX
     prepared = np.asarray(image, dtype=np.float32)
     if (wanted != size).any():
         prepared = np.asarray(
@@ -87,13 +85,13 @@ def _corners(image: U8, most: int) -> F64:
     corners = cv2.goodFeaturesToTrack(np.ascontiguousarray(image), most, _MIN_SHARE, _APART_PX)
     if corners is None:
         return np.zeros((0, 2))
-    return strongest_places(image, corners.reshape(-1, 2).astype(np.int64))
+    return detection.strongest_places(image, corners.reshape(-1, 2).astype(np.int64))
 
 
 def _cells(uv: F64, shape: tuple[int, ...]) -> F64:
     """Return where pixels (K, 2) of an image (H, W) lie among its cells, as the network was trained."""
     sides = np.array(shape[::-1])
-    return np.asarray(uv * (sides / CELL_PX) / (sides - 1) - 0.5)
+    return np.asarray(uv * (sides / xfeat_graph.CELL_PX) / (sides - 1) - 0.5)
 
 
 def _bicubic(values: F32, where: F64) -> F32:
