@@ -1,7 +1,5 @@
 """Visual-inertial mapping: merge, optimise, loop-close and sparsify maps of many sessions."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:

@@ -9,8 +9,6 @@ named in the entry-point group ``maplab_py.plugins`` of its distribution. See
 docs/writing_plugins.md, also for what of this is promised to stay.
 """
 
-from __future__ import annotations
-
 import importlib
 from typing import TYPE_CHECKING, Any
 

@@ -3,8 +3,6 @@
 A job calls kernels that are needed together with small arguments of the types that commands use.
 """
 
-from __future__ import annotations
-
 import gc
 import multiprocessing
 import os

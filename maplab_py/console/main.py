@@ -1,7 +1,5 @@
 """The program `maplab`: reads its command line and starts what it asks for."""
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import dataclasses

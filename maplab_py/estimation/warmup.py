@@ -1,7 +1,5 @@
 """The kernels of the optimiser, compiled before they are needed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 

@@ -3,8 +3,6 @@
 `python -m maplab_py.online_calibration.child SOCKET`, as `child_processes.Service` starts it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 

@@ -1,7 +1,5 @@
 """Options of the self-calibration beside the odometry."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Work of the process beside an odometry: it evaluates segments, keeps the database, and calibrates."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import itertools

@@ -1,7 +1,5 @@
 """Motions that would teach a device most about its calibration, by segments simulated with its sensors."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator, Mapping
 

@@ -10,8 +10,6 @@ From Python::
     report = run_pipeline(pipeline, Path("results"), PipelineOptions(scheduler="local:2"))
 """
 
-from __future__ import annotations
-
 import importlib
 from typing import TYPE_CHECKING, Any
 

@@ -6,8 +6,6 @@ verified. Then the neighbours only choose the missions: each query is compared w
 them belong to, one index for each, so that the work grows with the number of queries alone.
 """
 
-from __future__ import annotations
-
 import hashlib
 import threading
 from collections import OrderedDict

@@ -4,8 +4,6 @@ Nearest neighbours look at single descriptors. LighterGlue looks at all keypoint
 finds those that other light has changed too much for that, at about 0.1 s for two images.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.algorithms.loop_closure.candidates import Candidates, Matches

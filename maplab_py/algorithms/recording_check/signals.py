@@ -1,7 +1,5 @@
 """Signals of a recording that the checks look at, read once; images are sampled."""
 
-from __future__ import annotations
-
 import dataclasses
 from array import array
 from collections.abc import Iterable

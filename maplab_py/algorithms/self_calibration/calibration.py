@@ -1,7 +1,5 @@
 """Estimation of the calibration from all that a map contains, with its uncertainty and a report."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 

@@ -5,8 +5,6 @@ information; both add up over segments. Every family of parameters is tested ove
 end with the newest segment, as in a generalised likelihood ratio test for a change at an unknown time.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterable, Sequence
 

@@ -5,8 +5,6 @@ too small for the camera's position, because they do not contain errors of the m
 Hence the camera's position is limited, and results on parts of the data are compared.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Sequence
 

@@ -1,7 +1,5 @@
 """Comparison of two calibrations of a device, parameter by parameter."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.algorithms.self_calibration.reports import CalibrationComparison, ComparedParameter

@@ -1,7 +1,5 @@
 """The device that recorded the missions of a map, and its calibration."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

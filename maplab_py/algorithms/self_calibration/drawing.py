@@ -1,7 +1,5 @@
 """Trajectories from above, coloured by the information of segments, as SVG (Schneider 2019, figure 7.1)."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Flags of the self-calibration commands."""
 
-from __future__ import annotations
-
 from maplab_py.errors import UserError
 from maplab_py.options import Options, option
 

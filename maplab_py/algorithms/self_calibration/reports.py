@@ -1,7 +1,5 @@
 """Reports of the self-calibration commands."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

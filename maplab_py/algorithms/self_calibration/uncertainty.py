@@ -1,7 +1,5 @@
 """Uncertainty of calibrations."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from enum import Enum

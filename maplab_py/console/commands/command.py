@@ -1,7 +1,5 @@
 """Commands: plain functions whose keyword parameters are the flags."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import inspect

@@ -1,7 +1,5 @@
 """Types of flag values: text to value and back, with errors of one line."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import os

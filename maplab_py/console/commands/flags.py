@@ -1,7 +1,5 @@
 """Flags of commands and the parsing of words into flags."""
 
-from __future__ import annotations
-
 import dataclasses
 import enum
 import re

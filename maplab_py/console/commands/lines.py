@@ -1,7 +1,5 @@
 """Parsing of command lines: commands end at `;` and line ends, words are split as in a shell."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import re

@@ -1,7 +1,5 @@
 """The files of a new plugin distribution: one command, one test, a README."""
 
-from __future__ import annotations
-
 import re
 from string import Template
 

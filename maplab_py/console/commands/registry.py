@@ -1,7 +1,5 @@
 """The registry of commands: plugins from entry points, and the owners of names."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import gc

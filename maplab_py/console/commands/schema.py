@@ -1,7 +1,5 @@
 """JSON schemas of reports, derived from the types of their fields; the output of --json follows them."""
 
-from __future__ import annotations
-
 import ast
 import collections.abc
 import dataclasses

@@ -1,7 +1,5 @@
 """The interactive prompt: history, completion, colours, Ctrl-C and Ctrl-D."""
 
-from __future__ import annotations
-
 import datetime as dt
 import logging
 import os

@@ -1,7 +1,5 @@
 """Aliases: user-defined names of command lines."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Scripts: files of console commands, and maplab's batch files that run them on many maps."""
 
-from __future__ import annotations
-
 import dataclasses
 import glob
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Errors of a chain of commands that can be seen before anything of it runs."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

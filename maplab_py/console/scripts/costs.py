@@ -1,7 +1,5 @@
 """Time, memory and disk of commands: measured at every run, predicted for the steps of a script."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import statistics

@@ -1,7 +1,5 @@
 """Running command lines for a user: reports printed, errors as one line, an honest status."""
 
-from __future__ import annotations
-
 import io
 import logging
 import os

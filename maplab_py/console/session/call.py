@@ -1,7 +1,5 @@
 """One call of a command: from words or keyword arguments to typed values with their origins."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path

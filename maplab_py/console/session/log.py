@@ -1,7 +1,5 @@
 """The log file of a session: typed commands, warnings and tracebacks."""
 
-from __future__ import annotations
-
 import logging
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Paths of the user's files: never in the current folder."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Exit statuses, and which error means which."""
 
-from __future__ import annotations
-
 import os
 from enum import IntEnum
 

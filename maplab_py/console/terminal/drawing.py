@@ -1,7 +1,5 @@
 """Drawing the blocks of a report as lines of text, for a terminal or for a pipe."""
 
-from __future__ import annotations
-
 import dataclasses
 import textwrap
 

@@ -4,8 +4,6 @@ The prompt therefore returns soon even if the command is inside native code, whi
 interrupt: its thread is abandoned, and as maps are immutable its result has no effect.
 """
 
-from __future__ import annotations
-
 import queue
 import signal
 import sys

@@ -1,7 +1,5 @@
 """Layout of reports: paragraphs, pairs of name and value, tables."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import re

@@ -1,7 +1,5 @@
 """The interface of commands to a terminal, a script or a Python program."""
 
-from __future__ import annotations
-
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Protocol

@@ -1,7 +1,5 @@
 """Printing reports: plain text, colours on a terminal, or JSON."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os

@@ -1,7 +1,5 @@
 """The standard streams of the process: closed, broken and full ones."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import sys

@@ -1,7 +1,5 @@
 """The compiled kernels: visual ones for all cameras, batch ones per residual."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any

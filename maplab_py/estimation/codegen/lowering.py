@@ -5,8 +5,6 @@ A casadi SX function is a list of scalar instructions on work registers. Each be
 chooses, so that a kernel can index its arrays directly, without copies.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

@@ -6,8 +6,6 @@ anywhere gives a new folder, and a warm start does not import casadi. The module
 are used with every version of casadi.
 """
 
-from __future__ import annotations
-
 import hashlib
 import importlib.util
 import sys

@@ -4,8 +4,6 @@ numba infers a type for each of a thousand intermediate results that are all rea
 time it takes for such a function. Here each operation becomes one instruction, in the same order.
 """
 
-from __future__ import annotations
-
 import ast
 import inspect
 import math

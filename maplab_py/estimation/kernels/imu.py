@@ -13,8 +13,6 @@ second. (Forster et al., On-Manifold Preintegration, TRO 2017, eq. (31) holds w 
 instead, which is of first order.)
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The losses of `estimation.loss`, compiled."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

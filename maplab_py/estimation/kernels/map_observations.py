@@ -3,8 +3,6 @@
 Columns are those of the poses of all frames, six each, and then of the base frame.
 """
 
-from __future__ import annotations
-
 import math
 
 from maplab_py.array_types import F64, I32, I64, Mask

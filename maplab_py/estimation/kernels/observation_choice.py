@@ -1,7 +1,5 @@
 """Choose observations of landmarks by information (compiled loops)."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -12,8 +12,6 @@ Landmarks come in a fixed number of chunks with sums of their own, so results do
 number of threads.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

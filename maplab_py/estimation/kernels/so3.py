@@ -1,7 +1,5 @@
 """Rotations inside compiled loops: unit quaternions [x y z w], rotation vectors, matrices."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.compilation import compiled

@@ -4,8 +4,6 @@ Rows of a frame begin at 15 frame: position, orientation, velocity, biases of gy
 accelerometer. Only the lower triangle of the system's matrix is filled in.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.array_types import F64, I64, Mask

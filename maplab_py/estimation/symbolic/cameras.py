@@ -4,8 +4,6 @@ All projections divide x and y of a point by D(p), after which a distortion foll
 are those of `sensors.projection` and `sensors.distortion`.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import casadi

@@ -1,7 +1,5 @@
 """Rotations and poses as casadi expressions, with perturbations as everywhere in the project."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import casadi

@@ -4,8 +4,6 @@ Where half a trajectory turns about a far corner, twists keep its shape and sums
 it: Gauss-Newton needs half of the iterations.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -5,8 +5,6 @@ Jacobian by the tangents of its variables, in the order given. Poses are T_G_I; 
 whitened: weights belong to the term that uses the residual.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import casadi

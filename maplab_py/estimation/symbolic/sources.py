@@ -1,7 +1,5 @@
 """The residual functions by name, importable without casadi: it is loaded when one is made."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from enum import Enum
 from typing import Any

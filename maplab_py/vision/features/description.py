@@ -5,8 +5,6 @@ the direction of the keypoint's gradients. C++ maplab computes another pattern o
 not match each other. A map stores the size of every descriptor, and `lc` does not mix sizes.
 """
 
-from __future__ import annotations
-
 from operator import attrgetter
 from typing import Any
 

@@ -5,8 +5,6 @@ distance from tracked keypoints and from each other are taken. The strength is t
 Lucas-Kanade, not the response of the segment test: it tells corners from edges.
 """
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

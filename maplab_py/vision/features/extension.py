@@ -15,8 +15,6 @@ Example, with a network that the user names::
 `extract_features --feature_type=plugin:tiny --feature_model=tiny.onnx` then uses it.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path

@@ -4,8 +4,6 @@ SIFT descriptors (D. Lowe, IJCV 2004) are the square roots of their shares of th
 (R. Arandjelovic, A. Zisserman, CVPR 2012), as COLMAP stores them, so that the two match each other.
 """
 
-from __future__ import annotations
-
 import threading
 from typing import Any
 

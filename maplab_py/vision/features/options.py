@@ -1,7 +1,5 @@
 """Options of keypoints, with maplab's flag names where it has them."""
 
-from __future__ import annotations
-
 from maplab_py.errors import FlagError
 from maplab_py.options import Options, option
 

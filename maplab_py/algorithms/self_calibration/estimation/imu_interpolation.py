@@ -7,8 +7,6 @@ h^3 u'' / 12. With this subtracted from the samples at both ends, linear interpo
 cubics exactly (decision 16).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.array_types import F64, I64

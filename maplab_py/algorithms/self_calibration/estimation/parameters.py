@@ -1,7 +1,5 @@
 """The calibration parameters of a problem: place among the states, name, unit and prior."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 

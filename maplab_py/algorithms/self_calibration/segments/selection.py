@@ -1,7 +1,5 @@
 """Evaluation of the segments of a map and selection of the most informative (Schneider 2019, algorithm 3)."""
 
-from __future__ import annotations
-
 import dataclasses
 import time
 from collections.abc import Sequence

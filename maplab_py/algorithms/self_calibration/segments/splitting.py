@@ -1,7 +1,5 @@
 """Splitting missions into motion segments, and maps that contain only some keyframes."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -4,8 +4,6 @@ A pickle is a program. This reader follows three names only, those of a dictiona
 types of its numbers, and refuses the file at any other one before anything is called.
 """
 
-from __future__ import annotations
-
 import io
 import pickle
 import zipfile

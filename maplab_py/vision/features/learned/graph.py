@@ -1,7 +1,5 @@
 """Graphs in the ONNX format, built node by node from the arrays of a checkpoint."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -6,8 +6,6 @@ descriptors of both images until the same point has the same one. All keypoints 
 Linear maps that follow each other are folded into one.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.array_types import F64

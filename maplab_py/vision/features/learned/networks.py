@@ -1,7 +1,5 @@
 """Networks that the user has installed, opened once, by onnxruntime."""
 
-from __future__ import annotations
-
 import os
 import threading
 from collections.abc import Callable

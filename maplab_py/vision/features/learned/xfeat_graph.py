@@ -6,8 +6,6 @@ and give descriptors. Batch normalisation is part of the weights. The heads that
 pixels, are left out: corners are found more exactly (decision 35).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.vision.features.learned.checkpoint import Arrays
