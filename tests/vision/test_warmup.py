@@ -9,7 +9,7 @@ from maplab_py.vision import (
     track_union,
 )
 from maplab_py.vision.features import detection
-from maplab_py.vision.tracking import motion, patch_kernels, stereo_kernels, tracker
+from maplab_py.vision.tracking import flow_kernels, motion, patch_kernels, stereo_kernels, tracker
 from maplab_py.warmup import jobs
 from tests.vision.tracking.rendered import pose, stereo
 
@@ -64,6 +64,7 @@ def test_tracking_compiles_nothing_after_the_warmup():
         detection.corner_strengths,
         detection.occupy_all,
         detection.select_corners,
+        flow_kernels.follow_on_level,
         patch_kernels.align_patches,
         patch_kernels.sample_patches,
         stereo_kernels.check_matches,

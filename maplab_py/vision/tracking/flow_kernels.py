@@ -14,7 +14,8 @@ _LANES = 16
 """Rows of a patch are filled up with zeros to a multiple of it, so that whole vectors are computed."""
 _UPRIGHT_RAD = 0.01
 """Up to this turn patches are compared as they are (measured: keypoints drift by 0.3 px at 5 degrees)."""
-_ITERATIONS, _CONVERGED_PX = 20, 0.01
+_ITERATIONS, _CONVERGED_PX, _COARSELY_CONVERGED_PX = 20, 0.01, 0.05
+"""Steps in pixels of the image itself, and of the levels above, which only find where the next one begins."""
 _MIN_EIGENVALUE = np.float32(0.1)
 """Smallest mean square of the gradient in any direction [grey^2 / px^2]."""
 _ZERO, _UNITY, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
@@ -40,7 +41,7 @@ def follow_on_level(first, second, border, size, scale, turn, uv, there, is_trac
     stride = max(width, -(-(size + 2) // 8) * 8)
     square = np.zeros((size + 3) * stride, dtype=np.float32)
     template, du, dv = np.zeros((3, size * stride), dtype=np.float32)
-    half = size // 2
+    half, converged_px = size // 2, _CONVERGED_PX if scale == 1.0 else _COARSELY_CONVERGED_PX
     height_limit, width_limit = second.shape[0] - size - 2.0, second.shape[1] - width - 2.0
     for k in range(len(uv)):
         is_tracked[k] = False
@@ -64,11 +65,9 @@ def follow_on_level(first, second, border, size, scale, turn, uv, there, is_trac
             step_v = float((a * of_v - b * of_u) / determinant)
             u += step_u
             v += step_v
-            if step_u * step_u + step_v * step_v <= _CONVERGED_PX * _CONVERGED_PX:
+            if step_u * step_u + step_v * step_v <= converged_px * converged_px:
                 break
-            swings = (
-                abs(step_u + before_u) < _CONVERGED_PX and abs(step_v + before_v) < _CONVERGED_PX
-            )
+            swings = abs(step_u + before_u) < converged_px and abs(step_v + before_v) < converged_px
             if iteration > 0 and swings:
                 u -= 0.5 * step_u
                 v -= 0.5 * step_v

@@ -54,12 +54,14 @@ def _sample_patch(image, centre_u, centre_v, patch):  # type: ignore[no-untyped-
 @compiled(**_FAST)
 def _bilinear(image, u, v):  # type: ignore[no-untyped-def]
     """Return the grey value at a place inside the image."""
-    column, row = int(u), int(v)
+    # numbers without sign: those with one might count from the end of an array, which takes time to check
+    column, row, following = np.uint64(u), np.uint64(v), np.uint64(1)
     a, b = np.float32(u - column), np.float32(v - row)
-    above = (_UNITY - a) * np.float32(image[row, column]) + a * np.float32(image[row, column + 1])
-    below = (_UNITY - a) * np.float32(image[row + 1, column]) + a * np.float32(
-        image[row + 1, column + 1]
-    )
+    above = (_UNITY - a) * np.float32(image[row, column])
+    above += a * np.float32(image[row, column + following])
+    row += following
+    below = (_UNITY - a) * np.float32(image[row, column])
+    below += a * np.float32(image[row, column + following])
     return (_UNITY - b) * above + b * below
 
 
