@@ -24,6 +24,7 @@ from maplab_py.cancellation import cleaned_up
 from maplab_py.compilation import TARGET
 from maplab_py.estimation.warmup import optimizer_jobs
 from maplab_py.estimation.window.warmup import window_jobs
+from maplab_py.frontend import gyroscope
 from maplab_py.frontend.initialization import gyro_bias
 from maplab_py.geometry import se3
 from maplab_py.interop.colmap import binary as colmap_binary
@@ -68,6 +69,7 @@ def jobs() -> dict[str, Callable[[], None]]:
         "COLMAP points": colmap_binary.compile_kernels,
         "image rendering": _render_room,
         "start of the odometry": gyro_bias.compile_kernels,
+        "gyroscope": gyroscope.compile_kernels,
     }
 
 

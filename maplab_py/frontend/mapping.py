@@ -331,8 +331,10 @@ class Mapping:
 def load_kernels() -> None:
     """Load the machine code of the odometry, for which the first images of a robot would wait."""
     from maplab_py.estimation.window.warmup import window_jobs
+    from maplab_py.frontend import gyroscope
     from maplab_py.frontend.initialization import gyro_bias
     from maplab_py.vision.tracking import tracker
 
-    for load in (*window_jobs().values(), tracker.compile_kernels, gyro_bias.compile_kernels):
+    modules = tracker, gyro_bias, gyroscope
+    for load in (*window_jobs().values(), *(module.compile_kernels for module in modules)):
         load()

@@ -18,7 +18,7 @@ from maplab_py.estimation.window.options import MapRule
 from maplab_py.estimation.window.smoother import FixedLagSmoother
 from maplab_py.frontend.backfill import Backfill, Backfiller
 from maplab_py.frontend.failures.watch import SensorWatch
-from maplab_py.frontend.gyroscope import turn
+from maplab_py.frontend.gyroscope import turn, turn_angle_rad
 from maplab_py.frontend.health import HealthMonitor
 from maplab_py.frontend.image_delay import DelayMonitor
 from maplab_py.frontend.imu_buffer import ImuBuffer, ImuInterval
@@ -28,7 +28,6 @@ from maplab_py.frontend.motion import MotionDetector
 from maplab_py.frontend.odometry_options import OdometryOptions
 from maplab_py.frontend.odometry_update import OdometryCounts, OdometryStatus, OdometryUpdate
 from maplab_py.frontend.starting import MakeStarter, Start, Starter
-from maplab_py.geometry import so3
 from maplab_py.interop.recordings.protocol import (
     FrameSet,
     ImuBatch,
@@ -52,11 +51,9 @@ _NOISE_TIME_NS = 900_000_000
 class Odometry:
     """Estimates pose, velocity and biases of a rig of cameras with an IMU.
 
-    Samples and frames are pushed in the order of time. A frame is processed as soon as there is a
-    sample at its time or later; so any push may return updates.
-
-    When the estimate diverges or samples are missing for too long, the estimator starts again with
-    a new mission frame M; updates say so.
+    Samples and frames are pushed in the order of time. A frame is processed as soon as there is a sample at
+    its time or later. When the estimate diverges or samples are missing for too long, the estimator starts
+    again with a new mission frame M; updates say so.
     """
 
     def __init__(
@@ -114,6 +111,7 @@ class Odometry:
         self._backfiller = Backfiller(self._backward_smoother, is_wanted=self.options.backfill)
         self._starter: Starter = self._make_starter(device)
         self._gyro_bias: F64 = np.zeros(3)
+        self._newest_turn: tuple[ImuInterval, F64] | None = None
         self._start_again()
 
     def _initializer(self, device: RecordedSensors) -> Starter:
@@ -343,8 +341,8 @@ class Odometry:
         self, frame_set: FrameSet | TrackedFrameSet, interval: ImuInterval | None, failed: ImuPart
     ) -> tuple[TrackedImages, tuple[U8, ...]]:
         """Return the tracks of a frame set, and its images if it has some."""
-        has_turn = interval is not None and ImuPart.GYROSCOPE not in failed
-        R_I0_I1 = turn(self._imu, interval, self._gyro_bias) if interval and has_turn else None
+        is_usable = interval is not None and ImuPart.GYROSCOPE not in failed
+        R_I0_I1 = self._turn_in(interval) if interval and is_usable else None
         if isinstance(frame_set, TrackedFrameSet):
             self._replayed = tracked_images_of(
                 frame_set, self._replayed, self._device.cameras, self._device.T_I_C, R_I0_I1,
@@ -368,10 +366,13 @@ class Odometry:
 
     def _turn_rad(self, interval: ImuInterval) -> float:
         """Return the angle of a turn, 0 while the gyroscope's bias is not known."""
-        if self._smoother is None:
-            return 0.0
-        R_I0_I1 = turn(self._imu, interval, self._gyro_bias)
-        return float(np.linalg.norm(so3.log(so3.from_matrix(R_I0_I1))))
+        return 0.0 if self._smoother is None else turn_angle_rad(self._turn_in(interval))
+
+    def _turn_in(self, interval: ImuInterval) -> F64:
+        """Return the turn (3, 3) in an interval; the newest one is kept."""
+        if self._newest_turn is None or self._newest_turn[0] is not interval:
+            self._newest_turn = interval, turn(self._imu, interval, self._gyro_bias)
+        return self._newest_turn[1]
 
     def _visible_mps(self) -> float:
         """Return the speed at which the landmarks of the window would surely be seen to move."""

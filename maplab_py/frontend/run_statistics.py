@@ -106,7 +106,8 @@ class RunStatistics:
         parts = [f"{self.elapsed_s:.1f} s"]
         if self.frames > _RECENT:
             frame_ms = 1e3 * self.duration_s / (self.frames - 1)
-            spent_ms = max(self.stages(_RECENT)[-1].median_ms, 1e-3)
+            recent = np.asarray(self.stage_ms[-_RECENT * len(_STAGES) :]).reshape(-1, len(_STAGES))
+            spent_ms = max(float(np.median(recent.sum(axis=1))), 1e-3)
             parts.append(f"{frame_ms / spent_ms:.2g} x real time")
         if update.status is OdometryStatus.INITIALISING:
             parts.append(f"not started: {update.note}" if update.note else "not started")
@@ -115,10 +116,9 @@ class RunStatistics:
             parts.append(f"{update.window.num_landmarks} landmarks")
         return "  ".join(parts)
 
-    def stages(self, last: int = 0) -> tuple[StageTime, ...]:
-        """Return median and 99th percentile of each stage over the last frames; 0 = over all."""
-        rows = np.asarray(self.stage_ms[-last * len(_STAGES) :], dtype=np.float64)
-        table = rows.reshape(-1, len(_STAGES))
+    def stages(self) -> tuple[StageTime, ...]:
+        """Return median and 99th percentile of each stage over all frames."""
+        table = np.asarray(self.stage_ms, dtype=np.float64).reshape(-1, len(_STAGES))
         if not len(table):
             return ()
         used = [name for name, column in zip(_STAGES, table.T, strict=True) if column.any()]

@@ -19,6 +19,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64
 from maplab_py.compilation import compiled, prange
+from maplab_py.estimation.kernels import so3
 
 
 class EdgeSamples(NamedTuple):
@@ -383,6 +384,39 @@ def preintegrate(data: EdgeSamples, R_A_I: F64, noise: F64, result: EdgeMotion) 
             result.covariance[edge],
             result.jacobian[edge],
         )
+
+
+@compiled()
+def integrate_for_residuals(data, R_A_I, noise, g_G, floor, arguments, covariance):  # type: ignore[no-untyped-def]
+    """Integrate some edges, for residuals.
+
+    Args:
+        data: EdgeSamples.
+        R_A_I: Internal rotations (K, 3, 3).
+        noise: Squared densities (K, 2) of gyroscope and accelerometer.
+        g_G: Gravity (3,).
+        floor: (9, 9), added to covariances.
+        arguments: Filled in (E, 74): see `terms.inertial.measured_arguments`.
+        covariance: Filled in (E, 9, 9).
+    """
+    R, jacobian = np.empty((3, 3)), np.empty((9, 6))
+    for edge in range(len(data.start) - 1):
+        imu, x, P = data.imu_of_edge[edge], arguments[edge], covariance[edge]
+        R[:], P[:], x[:], jacobian[:] = 0.0, 0.0, 0.0, 0.0
+        _preintegrate_edge(
+            _edge(data, edge), R_A_I[imu], noise[imu], R, x[7:10], x[4:7], P, jacobian
+        )
+        so3.from_matrix(R, x[:4])
+        for column in range(6):
+            for row in range(9):
+                x[10 + 9 * column + row] = jacobian[row, column]
+        x[64:67], x[67:70], x[71:74] = data.gyro_bias[edge], data.accel_bias[edge], g_G
+        first, end = data.start[edge], data.start[edge + 1]
+        if end > first:
+            x[70] = (data.timestamp_ns[end - 1] - data.timestamp_ns[first]) * 1e-9
+        for row in range(9):
+            for column in range(9):
+                P[row, column] += floor[row, column]
 
 
 @compiled(parallel=True)

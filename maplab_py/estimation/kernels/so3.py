@@ -57,6 +57,28 @@ def to_matrix(q, out):  # type: ignore[no-untyped-def]
     )
 
 
+@compiled()
+def from_matrix(R, out):  # type: ignore[no-untyped-def]
+    """Compute the unit quaternion (4,) with w >= 0 of a rotation matrix, from its largest component."""
+    m00, m11, m22 = R[0, 0], R[1, 1], R[2, 2]
+    squares = (1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22, 1 + m00 + m11 + m22)
+    s01, s02, s12 = R[0, 1] + R[1, 0], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1]
+    d21, d02, d10 = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    largest = max(squares)
+    if squares[0] == largest:
+        q = (squares[0], s01, s02, d21)
+    elif squares[1] == largest:
+        q = (s01, squares[1], s12, d02)
+    elif squares[2] == largest:
+        q = (s02, s12, squares[2], d10)
+    else:
+        q = (d21, d02, d10, squares[3])
+    norm = np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    sign = -1.0 if q[3] < 0.0 else 1.0
+    for i in range(4):
+        out[i] = sign * (q[i] / norm)
+
+
 @compiled(forceinline=True)
 def log(q, out):  # type: ignore[no-untyped-def]
     """Compute the rotation vector (3,), of length <= pi; q and -q give the same."""

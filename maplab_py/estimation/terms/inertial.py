@@ -4,7 +4,8 @@ from types import ModuleType
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, Mask
+from maplab_py.compilation import compiled
 from maplab_py.estimation.imu.inertial_data import InertialData
 from maplab_py.estimation.imu.preintegration import Preintegrated, integrate
 from maplab_py.estimation.loss import Loss
@@ -63,12 +64,12 @@ class InertialTerm:
             new = integrate(self._data, b_g, b_a)
             self._whitening = whitening(new)
             self._set_measured(new)
-            self._seen = (b_g, b_a)
+            self._seen = np.concatenate([b_g, b_a], axis=1)
             return True
-        rows = outdated_edges(
-            (b_g, b_a), (old.gyro_bias, old.accel_bias), self._seen, old.duration_s
-        )
-        self._seen = (b_g, b_a)
+        now = np.concatenate([b_g, b_a], axis=1)
+        at = np.concatenate([old.gyro_bias, old.accel_bias], axis=1)
+        rows = outdated_edges(now, at, self._seen, old.duration_s)
+        self._seen = now
         if not len(rows):
             return False
         new = integrate(self._data.of_edges(rows), b_g[rows], b_a[rows])
@@ -128,23 +129,32 @@ class BiasWalkTerm(FixedMeasurements):
         return (biases[self._b] - biases[self._a]) * self._weight, self._jacobian
 
 
-Biases = tuple[F64, F64]
-"""Biases (E, 3) of gyroscope [rad/s] and accelerometer [m/s^2] at the beginning of edges."""
-
-
-def outdated_edges(now: Biases, integrated: Biases, before: Biases, duration_s: F64) -> I64:
+def outdated_edges(now: F64, integrated: F64, before: F64, duration_s: F64) -> I64:
     """Return the edges whose biases are too far from those they were integrated at.
 
     Args:
-        now: Biases at the present states.
+        now: Biases (E, 6) of gyroscope [rad/s] and accelerometer [m/s^2] at the beginning of edges.
         integrated: Biases at which the edges were integrated.
         before: Biases the last time this was asked, to see which have converged.
         duration_s: Of the edges (E,).
     """
-    away = _effect(now[0] - integrated[0], now[1] - integrated[1], duration_s)
-    change = _effect(now[0] - before[0], now[1] - before[1], duration_s)
-    has_converged = change <= _CONVERGED_SHARE * away
-    return np.flatnonzero((away > 1.0) | ((away > _REINTEGRATION_SHARE) & has_converged))
+    is_outdated: Mask = np.empty(len(duration_s), dtype=np.bool_)
+    _find_outdated(now, integrated, before, duration_s, is_outdated)
+    return np.flatnonzero(is_outdated)
+
+
+@compiled()
+def _find_outdated(now, integrated, before, duration_s, is_outdated):  # type: ignore[no-untyped-def]
+    """Fill in which edges (E,) are outdated; effects of changed biases are parts of what they may be."""
+    for edge in range(len(duration_s)):
+        away, change = 0.0, 0.0
+        for i in range(6):
+            scale = TURNED_RAD if i < 3 else SPEEDED_MPS
+            away = max(away, abs(now[edge, i] - integrated[edge, i]) / scale)
+            change = max(change, abs(now[edge, i] - before[edge, i]) / scale)
+        away, change = away * duration_s[edge], change * duration_s[edge]
+        has_converged = change <= _CONVERGED_SHARE * away
+        is_outdated[edge] = away > 1.0 or (away > _REINTEGRATION_SHARE and has_converged)
 
 
 def measured_arguments(measured: Preintegrated, g_G: F64) -> F64:
@@ -163,12 +173,6 @@ def measured_arguments(measured: Preintegrated, g_G: F64) -> F64:
         ],
         axis=1,
     )
-
-
-def _effect(gyro_radps: F64, accel_mps2: F64, duration_s: F64) -> F64:
-    """Return what changes (E, 3) of biases make of edges (E,), as parts of what they may."""
-    effect = np.maximum(np.abs(gyro_radps) / TURNED_RAD, np.abs(accel_mps2) / SPEEDED_MPS)
-    return np.asarray(effect.max(axis=1) * duration_s)
 
 
 def whitening(measured: Preintegrated) -> F64:

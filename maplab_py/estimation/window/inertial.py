@@ -6,17 +6,17 @@ from types import ModuleType
 import numpy as np
 
 from maplab_py.array_types import F64, I64, Mask
-from maplab_py.errors import MapError
-from maplab_py.estimation.imu import inertial_data, preintegration
-from maplab_py.estimation.terms.inertial import measured_arguments, outdated_edges, whitening
+from maplab_py.estimation.imu.inertial_data import InertialData
+from maplab_py.estimation.kernels import imu as kernels
+from maplab_py.estimation.terms.inertial import FLOOR, outdated_edges
 from maplab_py.estimation.window.frame import NO_PART, ImuPart
-from maplab_py.geometry import se3, so3
+from maplab_py.geometry import se3, so3, symmetric
 from maplab_py.sensors import Imu
 from maplab_py.vimap.table import starts_of_counts
 
 _SHORTEST_WALK_S = 1e-9
-_INPUTS, _MEASURED = 100, 74
-"""Inputs of the inertial residual, and how many of them do not depend on states."""
+_INPUTS, _MEASURED, _DURATION = 100, 74, 70
+"""Inputs of the inertial residual, how many of them do not depend on states, and the duration's place."""
 
 
 _COLUMNS = (
@@ -41,7 +41,12 @@ class InertialChain:
     def __init__(self, kernel: ModuleType, imu: Imu) -> None:
         """Begin without edges; the kernel is that of the residual `inertial`."""
         self._kernel, self._imu = kernel, imu
-        self._imus = tuple(_with_failed(imu, ImuPart(parts)) for parts in range(4))
+        imus = tuple(_with_failed(imu, ImuPart(parts)) for parts in range(4))
+        self._imus = InertialData(
+            np.zeros(1, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros((0, 6)), imus,
+            np.zeros(0, dtype=np.int64),
+        )  # fmt: skip
+        self._walk_density = np.sqrt(self._imus.walk_variance_density)
         self._g_M = np.array([0.0, 0.0, -imu.gravity_magnitude_mps2])
         self._samples: Samples = []
         self._arguments, self._whitening = np.zeros((0, _MEASURED)), np.zeros((0, 9, 9))
@@ -58,14 +63,8 @@ class InertialChain:
     @property
     def walk_weight(self) -> F64:
         """Inverse standard deviations (E, 2) of the walk of a bias' component, gyroscope first."""
-        densities = np.array(
-            [
-                (i.gyro_bias_random_walk_noise_density, i.acc_bias_random_walk_noise_density)
-                for i in self._imus
-            ]
-        )
         root_s = np.sqrt(np.maximum(self.duration_s, _SHORTEST_WALK_S))
-        weight = 1.0 / np.maximum(root_s[:, None] * densities[self._failed], 1e-9)
+        weight = 1.0 / np.maximum(root_s[:, None] * self._walk_density[self._failed], 1e-9)
         return np.where(self.is_open[:, None], 0.0, weight)
 
     def append(
@@ -96,6 +95,7 @@ class InertialChain:
             MapError: Times run backwards, or a sample is not a number.
         """
         count, biases = len(samples), motion[:, 3:]
+        samples = [_checked(*each) for each in samples]
         new = (
             np.zeros((count, _MEASURED)), np.zeros((count, 9, 9)), biases, biases,
             np.zeros(count), np.full(count, is_resting), np.zeros(count, dtype=np.bool_),
@@ -104,12 +104,7 @@ class InertialChain:
         self._samples += samples
         for name, values in zip(_COLUMNS, new, strict=True):
             setattr(self, name, np.concatenate([getattr(self, name), values]))
-        try:
-            self._integrate_stale()
-        except MapError:
-            for _ in range(count):
-                self.drop_last()
-            raise
+        self._integrate_stale()
 
     def predict(self, T_M_I: F64, motion: F64) -> tuple[F64, F64]:
         """Return pose (7,) and motion (9,) at the end of the last edge, from those at its start."""
@@ -167,14 +162,9 @@ class InertialChain:
     def relinearize(self, motion: F64) -> bool:
         """Integrate edges again whose biases (in F, 9) have moved far; tell whether any have."""
         self._integrate_stale()
-        biases = motion[: len(self), 3:]
-        outdated = outdated_edges(
-            (biases[:, :3], biases[:, 3:]),
-            (self._integrated_at[:, :3], self._integrated_at[:, 3:]),
-            (self._seen_at[:, :3], self._seen_at[:, 3:]),
-            self.duration_s,
-        )
-        self._seen_at = biases.copy()
+        biases = np.ascontiguousarray(motion[: len(self), 3:])
+        outdated = outdated_edges(biases, self._integrated_at, self._seen_at, self.duration_s)
+        self._seen_at = biases
         self._integrate(outdated, biases[outdated])
         return len(outdated) > 0
 
@@ -192,18 +182,6 @@ class InertialChain:
         residual, jacobian = self._kernel.evaluated(arguments, self._whitening[edges])
         return residual, jacobian
 
-    def _integrated(
-        self, samples: Samples, biases: F64, failed: I64
-    ) -> preintegration.Preintegrated:
-        data = inertial_data.InertialData(
-            sample_start=starts_of_counts(np.array([len(times_ns) for times_ns, _ in samples])),
-            timestamp_ns=np.concatenate([times_ns for times_ns, _ in samples], dtype=np.int64),
-            accel_gyro=np.concatenate([values for _, values in samples], dtype=np.float64),
-            imus=self._imus,
-            imu_of_edge=failed,
-        )
-        return preintegration.integrate(data, biases[:, :3], biases[:, 3:])
-
     def _integrate_stale(self) -> None:
         """Integrate edges whose samples are new or have been joined."""
         if self._is_stale.any():
@@ -214,17 +192,37 @@ class InertialChain:
         if not len(rows):
             return
         samples = [self._samples[row] for row in rows.tolist()]
-        measured = self._integrated(samples, biases, self._failed[rows])
-        self._arguments[rows] = measured_arguments(measured, self._g_M)
-        self._whitening[rows] = whitening(measured)
+        start = starts_of_counts(np.array([len(times_ns) for times_ns, _ in samples]))
+        times_ns, accel_gyro = map(np.concatenate, zip(*samples, strict=True))
+        data = kernels.EdgeSamples(
+            start, times_ns, accel_gyro, biases[:, :3].copy(), biases[:, 3:].copy(),
+            self._failed[rows], *self._imus.corrections,
+        )  # fmt: skip
+        arguments, covariance = np.empty((len(rows), _MEASURED)), np.empty((len(rows), 9, 9))
+        imus = self._imus.internal_rotation, self._imus.noise_variance_density
+        kernels.integrate_for_residuals(data, *imus, self._g_M, FLOOR, arguments, covariance)
+        self._arguments[rows] = arguments
+        self._whitening[rows] = symmetric.lower_whitening(covariance)
         self._integrated_at[rows] = self._seen_at[rows] = biases
-        self.duration_s[rows] = measured.duration_s
+        self.duration_s[rows] = arguments[:, _DURATION]
         self._is_stale[rows] = False
 
     def _drop(self, edge: int) -> None:
         del self._samples[edge]
         for name in _COLUMNS:
             setattr(self, name, np.delete(getattr(self, name), edge, axis=0))
+
+
+def _checked(times_ns: I64, accel_gyro: F64) -> tuple[I64, F64]:
+    """Return the samples of an edge as kernels read them.
+
+    Raises:
+        MapError: Times run backwards, or a sample is not a number.
+    """
+    start, imu = np.array([0, len(times_ns)], dtype=np.int64), np.zeros(1, dtype=np.int64)
+    times_ns = np.ascontiguousarray(times_ns, dtype=np.int64)
+    data = InertialData(start, times_ns, np.ascontiguousarray(accel_gyro, np.float64), (), imu)
+    return data.timestamp_ns, data.accel_gyro
 
 
 def _with_failed(imu: Imu, parts: ImuPart) -> Imu:

@@ -3,6 +3,7 @@
 import numpy as np
 
 from maplab_py.estimation.codegen.kernels import residual_kernel, window_kernels
+from maplab_py.estimation.kernels import imu
 from maplab_py.estimation.kernels import window as kernels
 from maplab_py.estimation.symbolic import sources
 from maplab_py.estimation.warmup import optimizer_jobs
@@ -20,6 +21,7 @@ def signatures() -> dict[str, set[object]]:
     }
     names = ("add_factors", "add_walks", "offsets", "retract", "camera_poses", "triangulate")
     compiled |= {name: getattr(kernels, name) for name in names}
+    compiled["integrate_for_residuals"] = imu.integrate_for_residuals
     for name in ("inertial", "relative_pose"):
         compiled[name] = residual_kernel(name, getattr(sources, name)).evaluate
     return {name: set(kernel.signatures) for name, kernel in compiled.items()}
