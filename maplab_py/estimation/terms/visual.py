@@ -31,6 +31,9 @@ from maplab_py.geometry import se3
 from maplab_py.vimap.table import starts_of_counts
 
 _BLOCKS_AT_ONCE = 65_536
+_LEAST_DAMPING = 1e-12
+"""Damping of a landmark's elimination in a large trust region: with less, the steps of landmarks at
+infinity are rounding, which only smaller regions would hold back."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -358,6 +361,7 @@ class VisualTerms:
         return visual_arguments.VisualStates(states.T_G_I, T_I_C, parameters, states.p_G, timing_s)
 
     def _rule(self, damping: float) -> visual_arguments.VisualRule:
+        damping = max(damping, _LEAST_DAMPING) if damping > 0.0 else 0.0
         return visual_arguments.VisualRule(int(self.loss), float(damping), self.moves_points)
 
 

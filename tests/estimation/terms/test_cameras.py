@@ -95,9 +95,14 @@ def make_scene(models: tuple[tuple[Projection, Distortion], ...], *, line_delays
     states = States(T_G_I, rng.normal(0, 1, (VERTICES, 3)), zero, zero, points)
     timing_s = rng.normal(0.0, [0.01, 3e-5], (size, 2))[:, : 2 if line_delays else 1]
     states = states.with_blocks(*camera_blocks(cameras, timing_s))
+    scene = Scene(visual, states, Problem(states, visual, ()), models)
+    # measured near the projections: a step that the landmarks' curvature spoils is refined
+    predicted_px = observations.uv_px + scene.residual(states) / INVERSE_SIGMA
+    noise_px = rng.normal(0.0, 1.0, (count, 2))
+    visual.use(dataclasses.replace(observations, uv_px=predicted_px + noise_px))
     visual.follow_motion(rng.normal(0, 1, (VERTICES, 3)))
     visual.refresh(states)
-    return Scene(visual, states, Problem(states, visual, ()), models)
+    return scene
 
 
 @pytest.fixture(scope="module")
@@ -444,3 +449,17 @@ def evaluate(kernel: object, x: np.ndarray, size: int, columns: int) -> tuple[np
     residual, jacobian = np.empty((1, size)), np.empty((1, size, columns))
     kernel.evaluate(x[None], np.eye(size)[None], residual, jacobian)  # type: ignore[attr-defined]
     return residual[0], jacobian[0]
+
+
+def test_a_landmark_whose_step_overshoots_is_refined() -> None:
+    scene = make_scene(TWO_MODELS, line_delays=True)
+    scene.states = dataclasses.replace(scene.states, p_G=3.0 * scene.states.p_G)
+    r, J = dense_equations(scene)
+    nodes = 3 * scene.states.num_nodes
+    step = np.linalg.solve(J[:, nodes:].T @ J[:, nodes:], -J[:, nodes:].T @ r).reshape(-1, 3)
+    plain = dataclasses.replace(scene.states, p_G=scene.states.p_G + step)
+    held = np.zeros((scene.states.num_nodes, 3))
+    p_G, cost, _ = scene.visual.take_step(scene.states, held, scene.states, 0.0)
+    assert cost < 0.9 * scene.visual.cost(plain)
+    refined = dataclasses.replace(scene.states, p_G=p_G)
+    assert cost == pytest.approx(scene.visual.cost(refined), rel=1e-12)
