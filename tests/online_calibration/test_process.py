@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import threading
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from maplab_py.algorithms.self_calibration.segments import selection
 from maplab_py.algorithms.self_calibration.segments.database import (
     load_database,
     locked_database,
     read_calibration,
 )
-from maplab_py.algorithms.self_calibration.segments.selection import collect
-from maplab_py.child_processes import Service
+from maplab_py.child_processes import Service, ServiceEnded
 from maplab_py.errors import FlagError
 from maplab_py.online_calibration.options import OnlineCalibrationOptions
 from maplab_py.online_calibration.process import OPTIONS, DeviceCalibration, Finish, Opening, Piece
@@ -46,7 +44,7 @@ def test_segments_are_kept_once_however_often_their_recording_is_read(tmp_path: 
     assert len(kept) == 3
     assert len(kept.vi_map.missions) == 1
     # the saved map of the same recording replaces them, too
-    again, _ = collect(session(), OPTIONS, kept)
+    again, _ = selection.collect(session(), OPTIONS, kept)
     assert {record.mission for record in again.records}.isdisjoint(
         record.mission for record in kept.records
     )
@@ -96,30 +94,42 @@ def test_a_device_at_rest_says_nothing(tmp_path: Path) -> None:
     assert status.contradiction is None
 
 
-def test_a_process_killed_at_any_time_leaves_a_whole_database(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("stage", "kept"),
+    [
+        ("selection.evaluate before", 1),
+        ("process.save_database before", 1),
+        ("process.save_database after", 2),
+        ("checks.calibrate_with_checks before", 2),
+        ("process.write_proposal after", 2),
+    ],
+)
+def test_a_process_killed_at_any_stage_leaves_a_whole_database(
+    tmp_path: Path, stage: str, kept: int
+) -> None:
     path = tmp_path / "device.segments"
-    device, segments = pieces(session())
+    device, segments = pieces(session(gyro_scale=1.02))
     first = DeviceCalibration(opening(path, device))
     first.answer(segments[0])
     first.answer(Finish())
-    before = path.read_bytes()
-    service = Service("maplab_py.online_calibration.child")
+    service = Service("tests.online_calibration.dying", *stage.split())
     service.ask(opening(path, device))
-    process = service._process
-    thread = threading.Thread(target=lambda: _ask_in_vain(service, segments[1]))
-    thread.start()
-    time.sleep(0.3)
-    os.kill(process.pid, signal.SIGKILL)
-    thread.join()
-    assert path.read_bytes() == before
-    with locked_database(path):  # nobody holds it any more
-        assert len(load_database(path)) == 1
-    assert sorted(file.name for file in tmp_path.iterdir()) == [path.name]
+    with pytest.raises(ServiceEnded) as error:
+        _ask_all(service, [*segments[1:], Finish()])
+    assert error.value.status == -signal.SIGKILL
+    # nobody holds it any more; segments of a recording that is read again replace those of before
+    with locked_database(path):
+        assert len(load_database(path)) == kept
+    again = DeviceCalibration(opening(path, device))
+    for request in (*segments, Finish()):
+        status = again.answer(request)
+    assert status.problem == ""
+    assert status.kept == len(load_database(path)) == 3
 
 
-def _ask_in_vain(service: Service, piece: Piece) -> None:
-    with pytest.raises(Exception, match="ended"):
-        service.ask(piece)
+def _ask_all(service: Service, requests: list[Piece | Finish]) -> None:
+    for request in requests:
+        service.ask(request)
 
 
 def test_two_processes_lose_no_segment(tmp_path: Path) -> None:

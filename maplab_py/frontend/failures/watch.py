@@ -251,10 +251,16 @@ class SensorWatch:
         ):
             return None
         alone = {row: self._comparison.compared(frozenset([row])) for row in cameras}
-        excess = {r: self._excess(each) for r, each in alone.items() if each is not None}
-        right = [row for row, size in excess.items() if size <= 1.0]
-        wrong = [row for row, size in excess.items() if size > 1.0]
+        known = {row: each for row, each in alone.items() if each is not None}
+        wrong = [row for row, each in known.items() if self._is_unusual(each)]
+        right = [row for row in known if row not in wrong]
         if len(right) == 0 or len(wrong) != 1:
+            return None
+        bad, good = known[wrong[0]], known[right[0]]
+        apart = dataclasses.replace(
+            bad, rate=bad.rate - good.rate, acceleration=bad.acceleration - good.acceleration
+        )
+        if not self._is_unusual(apart):  # the cameras agree: it is the IMU, near the limit
             return None
         self._fail(f"camera {wrong[0]}", _SHIFTED, joint.since_ns, now_ns)
         return wrong[0]

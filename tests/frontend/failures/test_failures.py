@@ -161,18 +161,24 @@ def _frame(cameras: int = 1) -> Any:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", ["camera 1", "gyroscope"])
+@pytest.mark.parametrize("kind", ["camera 1", "gyroscope", "gyroscope at the limit"])
 def test_a_shifted_camera_is_told_from_a_wrong_gyroscope(kind: str) -> None:
     rng, watch, frame, window = np.random.default_rng(6), _watch(2), _frame(2), _window()
     for row in range(1, 100):
         samples = _resting(rng)
         if row == 81 and kind == "camera 1":
             frame.uv_px[60:] += [7.0, 0.0]  # 2 deg
-        samples[:, 5] += 0.05 if row > 80 and kind == "gyroscope" else 0.0
+        if row > 80 and kind.startswith("gyroscope"):
+            samples[:, 5] += 0.05 if kind == "gyroscope" else 0.032
+        if row > 80 and kind.endswith("limit"):  # for camera 1 it is just below
+            turned_rad = 1e-9 * _FRAME_NS * 3e-3
+            x, y = (frame.uv_px - [160.0, 120.0]).T
+            is_other = np.arange(120)[:, None] >= 60
+            frame.uv_px = frame.uv_px - turned_rad * is_other * np.column_stack([-y, x])
         frame.time_ns = row * _FRAME_NS
         watch.usable(_interval(row, samples), window)
         watch.compare(frame, _interval(row, samples), window)
-    assert [failure.sensor for failure in watch.failures] == [kind]
+    assert [failure.sensor for failure in watch.failures] == [kind.removesuffix(" at the limit")]
     assert watch.left_out == (frozenset([1]) if kind == "camera 1" else frozenset())
 
 
