@@ -16,6 +16,8 @@ _STEP_CELLS = (1, 2, 5, 10, 20, 50)
 _MAX_INTERVALS = 7
 _CORNER = 0.3
 """Coordinates along x and y that are closer than this part of their distance share a label."""
+_FLAT = 0.085
+"""Height of a map, as a part of its longer side, below which the label at its top would lie on others."""
 _BAR_COLOUR = colours.from_hex("#6b7280")[0]
 
 
@@ -47,7 +49,7 @@ def make_ground(extent: Extent, origin_G: F64) -> Ground:
     position = np.array([centre[0], centre[1], extent.floor_m])
     step = _label_step_m(float((high - low)[:2].max()), cell)
     labels, p_labels = _axis_labels(low, high, origin_G, step)
-    aside = np.array([0.0, -cell, 0.0])
+    aside = np.array([0.0, -2.0 * cell, 0.0])
     start, end = low + aside, low + aside + np.array([step, 0.0, 0.0])
     bar = make_segments(start[None], end[None], _BAR_COLOUR, np.array([0]), 5.0)
     labels.append(f"{step:g} m")
@@ -96,7 +98,7 @@ def _axis_labels(low: F64, high: F64, origin_G: F64, step: float) -> tuple[list[
                 continue
             labels.append(label)
             places.append(place)
-    if high[2] > low[2]:
+    if high[2] - low[2] > _FLAT * (high - low)[:2].max():
         labels.append(f"z {high[2] + origin_G[2]:.1f}")
         places.append(np.array([low[0], low[1], high[2]]))
     return labels, places

@@ -35,7 +35,7 @@ def test_the_recipe_ends_well(before: str, tmp_path: Path) -> None:
     for text in (before.format(data=shared_data()), recipe("map")):
         done = run_program(tmp_path, "-c", text, "--json", seconds=3600.0)
         assert done.returncode == 0, done.stderr
-    reports = [json.loads(line) for line in done.stdout.splitlines()]
+    reports = [json.loads(line)["report"] for line in done.stdout.splitlines()]
     first, last = (report for report in reports if "mean_reprojection_after_px" in report)
     assert last["mean_reprojection_after_px"] < 1.02 * first["mean_reprojection_after_px"] < 1.5
     assert len(load_map(tmp_path / "map")[0].missions) == 1

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from maplab_py.storage.mission_names import named
 from maplab_py.viewer.building import Subject, build_scene
+from maplab_py.viewer.display.camera import FIELD_OF_VIEW_RAD, view_of, window_of
 from maplab_py.viewer.drawing import PATH_ENDS, make_drawing, with_end_labels
 from maplab_py.viewer.ground import cell_size_m, make_ground
 from maplab_py.viewer.options import VisualizationOptions
@@ -59,6 +63,35 @@ def test_coordinates_at_a_corner_share_a_label() -> None:
     ground = make_ground(_extent(np.zeros(3), np.array([60.0, 60.0, 3.0])), np.zeros(3))
     assert ground.labels[0] == "x 0, y 0"
     assert "y 0" not in ground.labels
+
+
+PHONE, TABLET, WIDE = (390, 844), (800, 900), (1440, 900)
+
+
+@pytest.mark.parametrize("size_px", [PHONE, TABLET, WIDE])
+@pytest.mark.parametrize(
+    "size_m", [(45.0, 20.0, 4.0), (11.0, 9.0, 6.0), (4.0, 5.0, 2.5), (300.0, 80.0, 20.0)]
+)
+def test_labels_do_not_overlap(
+    size_m: tuple[float, float, float], size_px: tuple[int, int]
+) -> None:
+    low = np.array([-3.1, -11.0, -1.2])
+    corners = low + np.array(list(itertools.product((0.0, 1.0), repeat=3))) * size_m
+    seen = dataclasses.replace(_extent(low, low + size_m), outline=corners)
+    ground = make_ground(seen, np.zeros(3))
+    page: Any = SimpleNamespace(aspect=size_px[0] / size_px[1], image_width=size_px[0])
+    eye, target = view_of(seen, beside_panel=True, window=window_of(page))
+    back = (eye - target) / np.linalg.norm(eye - target)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right /= np.linalg.norm(right)
+    p = (ground.p_labels - eye) @ np.stack([right, np.cross(back, right), back]).T
+    at_px = p[:, :2] / -p[:, 2:] * 0.5 * size_px[1] / np.tan(0.5 * FIELD_OF_VIEW_RAD)
+    width_px = 6.0 * np.array([len(label) for label in ground.labels])
+    for a, b in itertools.combinations(range(len(at_px)), 2):
+        left, other = (a, b) if at_px[a, 0] <= at_px[b, 0] else (b, a)
+        is_beside = at_px[left, 0] + width_px[left] <= at_px[other, 0]
+        is_above = abs(at_px[a, 1] - at_px[b, 1]) >= 11.0
+        assert is_beside or is_above, (ground.labels[a], ground.labels[b])
 
 
 def test_a_map_without_height_has_no_upright_label() -> None:

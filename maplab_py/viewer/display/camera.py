@@ -24,7 +24,12 @@ _MARGIN = 1.08
 _FREE = 0.74
 """Part of a page's width that the panel leaves free."""
 _FREE_HEIGHT = 0.58
-"""Part of an upright page's height that the sheet at its lower edge leaves free."""
+"""Part of a phone's height that the sheet at its lower edge leaves free."""
+_PANEL_PX, _PHONE_PX = 340, 600
+"""Width of the panel; pages up to the other width have a sheet instead, see `page.css`."""
+Window = tuple[float, float, float]
+"""Width by height of a page, and the parts of both that are free."""
+_WIDE: Window = (_ASPECT, _FREE, 1.0)
 _LEAST_SHARE, _ROOM = 0.5, 1.25
 """Share of the picture below which a map is moved closer to; room that a map gets to grow."""
 
@@ -35,7 +40,7 @@ def view_of(
     *,
     beside_panel: bool = False,
     room: float = 1.0,
-    upright: float = 0.0,
+    window: Window = _WIDE,
 ) -> tuple[F64, F64]:
     """Return camera position (3,) and target (3,) that just show the whole outline; z is up.
 
@@ -46,7 +51,7 @@ def view_of(
         view: One of `VIEWS`.
         beside_panel: Leave the part of the page free that the panel covers.
         room: Width of the picture by that of the outline.
-        upright: Width by height of an upright page; 0 = it is not upright.
+        window: Form of the page.
     """
     azimuth = _across(extent.outline)
     if view == "overview":
@@ -63,10 +68,8 @@ def view_of(
     right = right / np.linalg.norm(right)
     axes = np.stack([right, np.cross(back, right), back])
     p = (extent.outline - extent.centre) @ axes.T
-    half = np.tan(0.5 * FIELD_OF_VIEW_RAD) * np.array([upright or _ASPECT, 1.0])
-    free = (
-        np.array([1.0, _FREE_HEIGHT] if upright else [_FREE, 1.0]) if beside_panel else np.ones(2)
-    )
+    half = np.tan(0.5 * FIELD_OF_VIEW_RAD) * np.array([window[0], 1.0])
+    free = np.array(window[1:]) if beside_panel else np.ones(2)
     tangent = half * free / (_MARGIN * room)
     middle = 0.5 * (p[:, :2].min(axis=0) + p[:, :2].max(axis=0))
     for _ in range(3):  # near points need more room: centre what is seen, not what is there
@@ -118,7 +121,7 @@ class Cameras:
         self._given: dict[int, F64] = {}  # where a page's camera was put, by client
         self._extent: Extent | None = None
         self._room = 1.0
-        server.on_client_connect(self._aim_upright)
+        server.on_client_connect(self._aim_narrow)
 
     def show_all(self, extent: Extent) -> None:
         """Let all pages, and those that will be opened, see everything."""
@@ -147,13 +150,13 @@ class Cameras:
         self.aim_new_pages(extent)
         for client in clients:
             self._show(client, extent, self._view)
-            self._aim_upright(client)
+            self._aim_narrow(client)
 
-    def _aim_upright(self, client: Any) -> None:
-        """Let an upright page, as that of a phone, see everything above its panel."""
-        aspect = float(client.camera.aspect)
-        if self._extent is not None and aspect < 1.0:
-            view = view_of(self._extent, beside_panel=True, room=self._room, upright=aspect)
+    def _aim_narrow(self, client: Any) -> None:
+        """Let a page that is narrower than others, as that of a phone, see everything beside its panel."""
+        window = window_of(client.camera)
+        if self._extent is not None and window is not _WIDE:
+            view = view_of(self._extent, beside_panel=True, room=self._room, window=window)
             self._show(client, self._extent, view)
 
     def _show(self, client: Any, extent: Extent, view: tuple[F64, F64]) -> None:
@@ -162,9 +165,19 @@ class Cameras:
         self._given[client.client_id] = view[0]
 
 
+def window_of(camera: Any) -> Window:
+    """Return the form of a page; all that are wide enough have the same."""
+    width_px, aspect = int(camera.image_width), float(camera.aspect)
+    if width_px <= _PHONE_PX:
+        return aspect, 1.0, _FREE_HEIGHT
+    free = max(1.0 - _PANEL_PX / width_px, 0.1)
+    return (aspect, free, 1.0) if aspect * free < _ASPECT * _FREE else _WIDE
+
+
 def aim(camera: Any, extent: Extent, view: str = "overview", *, beside_panel: bool = True) -> None:
     """Point the camera of a page."""
-    _look(camera, extent, view_of(extent, view, beside_panel=beside_panel))
+    window = window_of(camera) if beside_panel else _WIDE
+    _look(camera, extent, view_of(extent, view, beside_panel=beside_panel, window=window))
 
 
 def _look(camera: Any, extent: Extent, view: tuple[F64, F64]) -> None:

@@ -145,7 +145,9 @@ def verdicts_of_page(context: CommandContext) -> list[list[str]]:
     """
     following = context.session.watchers.find(NAME, Following)
     if following is None or following.viewer.is_stopped:
-        raise UserError("judge_closures: give --accept or --refuse, or judge in the page: visualize")
+        raise UserError(
+            "judge_closures: give --accept or --refuse, or judge in the page: visualize"
+        )
     verdicts = following.viewer.court.take_verdicts()
     if not verdicts:
         raise UserError(

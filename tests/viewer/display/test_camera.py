@@ -19,8 +19,10 @@ def extent(radius_m: float, centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
     return Extent(np.asarray(centre), radius_m, centre[2], outline)
 
 
-def page(number: int, aspect: float = 1.6) -> Any:
-    camera = SimpleNamespace(position=np.zeros(3), look_at=np.zeros(3), aspect=aspect)
+def page(number: int, width_px: int = 1440, height_px: int = 900) -> Any:
+    camera = SimpleNamespace(
+        position=np.zeros(3), look_at=np.zeros(3), aspect=width_px / height_px, image_width=width_px
+    )
     return SimpleNamespace(client_id=number, camera=camera, atomic=threading.Lock)
 
 
@@ -66,29 +68,35 @@ def test_pages_follow_a_map_that_grows_until_they_are_moved() -> None:
     np.testing.assert_array_equal(pages[7].camera.position, pages[3].camera.position)
 
 
-def test_a_phone_sees_everything_above_its_sheet() -> None:
+@pytest.mark.parametrize(
+    ("size_px", "right", "lower"),
+    [((390, 844), 1.0, -0.16), ((800, 900), 0.15, -1.0), ((1000, 700), 0.32, -1.0)],
+    ids=["a phone, above its sheet", "a tablet, beside the panel", "a small window"],
+)
+def test_narrow_pages_see_everything(size_px: tuple[int, int], right: float, lower: float) -> None:
     seen = extent(4.0, (5.0, -2.0, 1.0))
-    phones, connected = {1: page(1, 390 / 844)}, []
+    pages, connected = {1: page(1, *size_px)}, []
     server = SimpleNamespace(
         initial_camera=SimpleNamespace(),
-        get_clients=lambda: phones,
+        get_clients=lambda: pages,
         on_client_connect=connected.append,
     )
     cameras = Cameras(server)
     cameras.show_all(seen)
-    phones[2] = page(2, 390 / 844)
-    connected[0](phones[2])
-    for phone in phones.values():
-        back = phone.camera.position - phone.camera.look_at
+    pages[2] = page(2, *size_px)
+    connected[0](pages[2])
+    aspect = size_px[0] / size_px[1]
+    for each in pages.values():
+        back = each.camera.position - each.camera.look_at
         back /= np.linalg.norm(back)
-        right = np.cross([0.0, 0.0, 1.0], back)
-        right /= np.linalg.norm(right)
-        p = (seen.outline - phone.camera.position) @ np.stack(
-            [right, np.cross(back, right), back]
-        ).T
-        at = p[:, :2] / (-p[:, 2:] * np.tan(0.5 * FIELD_OF_VIEW_RAD))
-        assert np.abs(at[:, 0]).max() < 390 / 844
-        assert -0.16 - 1e-6 < at[:, 1].min() < at[:, 1].max() < 1.0
-    before = phones[2].camera.position
+        across = np.cross([0.0, 0.0, 1.0], back)
+        across /= np.linalg.norm(across)
+        axes = np.stack([across, np.cross(back, across), back])
+        p = (seen.outline - each.camera.position) @ axes.T
+        at = p[:, :2] / (-p[:, 2:] * np.tan(0.5 * FIELD_OF_VIEW_RAD) * [aspect, 1.0])
+        assert -1.0 < at[:, 0].min() < at[:, 0].max() < right + 1e-6
+        assert lower - 1e-6 < at[:, 1].min() < at[:, 1].max() < 1.0
+        assert (0.5 * np.ptp(at, axis=0) / [0.5 * (right + 1.0), 0.5 * (1.0 - lower)]).max() > 0.7
+    before = pages[2].camera.position
     cameras.keep_in_view(extent(30.0))  # nobody has moved it
-    assert np.linalg.norm(phones[2].camera.position - before) > 10.0
+    assert np.linalg.norm(pages[2].camera.position - before) > 10.0
