@@ -79,7 +79,7 @@ def test_labels_do_not_overlap(
     corners = low + np.array(list(itertools.product((0.0, 1.0), repeat=3))) * size_m
     seen = dataclasses.replace(_extent(low, low + size_m), outline=corners)
     ground = make_ground(seen, np.zeros(3))
-    page: Any = SimpleNamespace(aspect=size_px[0] / size_px[1], image_width=size_px[0])
+    page: Any = SimpleNamespace(aspect=size_px[0] / size_px[1])
     eye, target = view_of(seen, beside_panel=True, window=window_of(page))
     back = (eye - target) / np.linalg.norm(eye - target)
     right = np.cross([0.0, 0.0, 1.0], back)

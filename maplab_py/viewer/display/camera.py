@@ -25,8 +25,11 @@ _FREE = 0.74
 """Part of a page's width that the panel leaves free."""
 _FREE_HEIGHT = 0.58
 """Part of a phone's height that the sheet at its lower edge leaves free."""
-_PANEL_PX, _PHONE_PX = 340, 600
-"""Width of the panel; pages up to the other width have a sheet instead, see `page.css`."""
+_PANEL, _PHONE = 0.38, 0.65
+"""Width of the panel by the height of a page; width by height up to which a page has a sheet instead.
+
+Pages tell their size in pixels of the device, which differ; so only its form counts.
+"""
 Window = tuple[float, float, float]
 """Width by height of a page, and the parts of both that are free."""
 _WIDE: Window = (_ASPECT, _FREE, 1.0)
@@ -121,7 +124,7 @@ class Cameras:
         self._given: dict[int, F64] = {}  # where a page's camera was put, by client
         self._extent: Extent | None = None
         self._room = 1.0
-        server.on_client_connect(self._aim_narrow)
+        server.on_client_connect(self._open)
 
     def show_all(self, extent: Extent) -> None:
         """Let all pages, and those that will be opened, see everything."""
@@ -149,15 +152,29 @@ class Cameras:
         self._view = view_of(extent, beside_panel=True, room=room)
         self.aim_new_pages(extent)
         for client in clients:
-            self._show(client, extent, self._view)
-            self._aim_narrow(client)
+            self._fit(client)
 
-    def _aim_narrow(self, client: Any) -> None:
-        """Let a page that is narrower than others, as that of a phone, see everything beside its panel."""
-        window = window_of(client.camera)
-        if self._extent is not None and window is not _WIDE:
+    def _open(self, client: Any) -> None:
+        """Fit the map into a page that is narrower than others, and into each whose form changes."""
+        form = [_WIDE]
+
+        def fit_again(camera: Any) -> None:
+            window = window_of(camera)
+            if abs(window[0] - form[0][0]) > 0.01 and self._is_unmoved(client.client_id, client):
+                form[0] = window
+                self._fit(client)
+
+        fit_again(client.camera)
+        client.camera.on_update(fit_again)
+
+    def _fit(self, client: Any) -> None:
+        """Let a page see everything beside its panel."""
+        if self._extent is None:
+            return
+        window, view = window_of(client.camera), self._view
+        if window is not _WIDE:
             view = view_of(self._extent, beside_panel=True, room=self._room, window=window)
-            self._show(client, self._extent, view)
+        self._show(client, self._extent, view)
 
     def _show(self, client: Any, extent: Extent, view: tuple[F64, F64]) -> None:
         with client.atomic():
@@ -167,10 +184,10 @@ class Cameras:
 
 def window_of(camera: Any) -> Window:
     """Return the form of a page; all that are wide enough have the same."""
-    width_px, aspect = int(camera.image_width), float(camera.aspect)
-    if width_px <= _PHONE_PX:
+    aspect = float(camera.aspect)
+    if aspect <= _PHONE:
         return aspect, 1.0, _FREE_HEIGHT
-    free = max(1.0 - _PANEL_PX / width_px, 0.1)
+    free = 1.0 - _PANEL / aspect
     return (aspect, free, 1.0) if aspect * free < _ASPECT * _FREE else _WIDE
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -20,9 +21,11 @@ def extent(radius_m: float, centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 def page(number: int, width_px: int = 1440, height_px: int = 900) -> Any:
+    heard: list[Callable[[Any], None]] = []
     camera = SimpleNamespace(
-        position=np.zeros(3), look_at=np.zeros(3), aspect=width_px / height_px, image_width=width_px
-    )
+        position=np.zeros(3), look_at=np.zeros(3), aspect=width_px / height_px,
+        on_update=heard.append, heard=heard,
+    )  # fmt: skip
     return SimpleNamespace(client_id=number, camera=camera, atomic=threading.Lock)
 
 
@@ -70,12 +73,13 @@ def test_pages_follow_a_map_that_grows_until_they_are_moved() -> None:
 
 @pytest.mark.parametrize(
     ("size_px", "right", "lower"),
-    [((390, 844), 1.0, -0.16), ((800, 900), 0.15, -1.0), ((1000, 700), 0.32, -1.0)],
+    [((390, 844), 1.0, -0.16), ((800, 900), 0.15, -1.0), ((900, 700), 0.41, -1.0)],
     ids=["a phone, above its sheet", "a tablet, beside the panel", "a small window"],
 )
 def test_narrow_pages_see_everything(size_px: tuple[int, int], right: float, lower: float) -> None:
     seen = extent(4.0, (5.0, -2.0, 1.0))
-    pages, connected = {1: page(1, *size_px)}, []
+    pages = {1: page(1, *size_px)}
+    connected: list[Callable[[Any], None]] = []
     server = SimpleNamespace(
         initial_camera=SimpleNamespace(),
         get_clients=lambda: pages,
@@ -83,8 +87,11 @@ def test_narrow_pages_see_everything(size_px: tuple[int, int], right: float, low
     )
     cameras = Cameras(server)
     cameras.show_all(seen)
-    pages[2] = page(2, *size_px)
+    pages[2] = page(2, 300, 150)  # a page tells this before it is laid out
+    pages[2].camera.position = np.array(server.initial_camera.position)
     connected[0](pages[2])
+    pages[2].camera.aspect = size_px[0] / size_px[1]
+    pages[2].camera.heard[0](pages[2].camera)
     aspect = size_px[0] / size_px[1]
     for each in pages.values():
         back = each.camera.position - each.camera.look_at
