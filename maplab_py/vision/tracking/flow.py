@@ -6,11 +6,14 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.array_types import F64, U8, Mask
+from maplab_py.array_types import F64, I64, U8, Mask
 from maplab_py.vision.tracking import flow_kernels
 
 _BORDER_PX = 16
 """Border of the levels beyond two sides of a patch, so that those at the edge of an image can be compared."""
+
+_LEVELS_OF_NEAR = 1
+"""Level on which the search for keypoints begins that are expected within a few pixels."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +52,12 @@ class Pyramid:
 
 
 def follow(
-    first: U8 | Pyramid, second: U8 | Pyramid, uv: F64, predicted_uv: F64, options: FlowOptions
+    first: U8 | Pyramid,
+    second: U8 | Pyramid,
+    uv: F64,
+    predicted_uv: F64,
+    options: FlowOptions,
+    is_near: Mask | None = None,
 ) -> tuple[F64, Mask]:
     """Find keypoints of an image again in another one.
 
@@ -59,6 +67,7 @@ def follow(
         uv: Keypoints (K, 2).
         predicted_uv: Where they are expected (K, 2).
         options: Parameters.
+        is_near: Keypoints (K,) that are expected within a few pixels: lower levels will do for them.
 
     Returns:
         Keypoints (K, 2) in the second image, and whether they were found (K,): inside the image,
@@ -68,7 +77,7 @@ def follow(
         image if isinstance(image, Pyramid) else Pyramid.of(image, options)
         for image in (first, second)
     )
-    there, is_tracked = search(first, second, uv, predicted_uv, options)
+    there, is_tracked = search(first, second, uv, predicted_uv, options, is_near=is_near)
     return there, is_tracked & is_tracked_back(first, second, uv, there, options)
 
 
@@ -79,9 +88,13 @@ def search(
     predicted_uv: F64,
     options: FlowOptions,
     turn: F64 | None = None,
+    is_near: Mask | None = None,
 ) -> tuple[F64, Mask]:
     """Find keypoints as `follow` does, without the way back, with a turn (2, 2) of the image."""
-    there, is_tracked = _flow(first, second, uv, predicted_uv, options, len(first.levels), turn)
+    levels = np.full(len(uv), len(first.levels) - 1)
+    if is_near is not None:
+        levels[is_near] = min(_LEVELS_OF_NEAR, len(first.levels) - 1)
+    there, is_tracked = _flow(first, second, uv, predicted_uv, options, levels, turn)
     height, width = second.image.shape
     inside = np.all((there >= 0.0) & (there <= np.array([width - 1, height - 1])), axis=1)
     return there, is_tracked & inside
@@ -98,7 +111,9 @@ def is_tracked_back(
     """Tell which keypoints (K, 2) are tracked from the second image back to where they came from."""
     # the way back starts at its end: it needs no pyramid
     back_turn = None if turn is None else np.ascontiguousarray(turn.T)
-    back, is_back = _flow(second, first, there, uv, options, 1, back_turn)
+    back, is_back = _flow(
+        second, first, there, uv, options, np.zeros(len(uv), dtype=np.int64), back_turn
+    )
     error = np.linalg.norm(back - uv, axis=1)
     return np.asarray(is_back & (error <= options.forward_backward_px))
 
@@ -116,15 +131,15 @@ def _flow(
     uv: F64,
     guess_uv: F64,
     options: FlowOptions,
-    levels: int,
+    levels: I64,
     turn: F64 | None,
 ) -> tuple[F64, Mask]:
     there = np.array(guess_uv, dtype=np.float64, order="C")
     is_tracked: Mask = np.zeros(len(uv), dtype=np.bool_)
     turn = np.eye(2) if turn is None else turn
-    for level in range(levels - 1, -1, -1):
+    for level in range(int(levels.max(initial=0)), -1, -1):
         flow_kernels.follow_on_level(
             first.levels[level], second.levels[level], first.border_px, options.patch_size_px,
-            0.5**level, turn, uv, there, is_tracked,
+            level, turn, uv, there, levels, is_tracked,
         )  # fmt: skip
     return np.where(is_tracked[:, None], there, uv), is_tracked

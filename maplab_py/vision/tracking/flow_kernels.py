@@ -23,7 +23,7 @@ _MIDDLE, _SIDE = np.float32(10.0 / 32.0), np.float32(3.0 / 32.0)
 
 
 @compiled(**_FAST)
-def follow_on_level(first, second, border, size, scale, turn, uv, there, is_tracked):  # type: ignore[no-untyped-def]
+def follow_on_level(first, second, border, size, level, turn, uv, there, levels, is_tracked):  # type: ignore[no-untyped-def]
     """Move keypoints to where a level of the second image looks as the first one about them.
 
     Args:
@@ -31,20 +31,24 @@ def follow_on_level(first, second, border, size, scale, turn, uv, there, is_trac
         second: Those of the other image.
         border: Width of the border [px].
         size: Side of the patches [px], odd.
-        scale: Pixels of the level per pixel of the image.
+        level: Halvings of the image.
         turn: (2, 2) from offsets in the first image to those in the second.
         uv: Keypoints (K, 2) in the first image.
         there: Where they are expected in the second one (K, 2); changed.
+        levels: Levels above the image (K,) on which a keypoint is sought; it stays on others.
         is_tracked: Filled in (K,): the level shows the patch, and it can be followed.
     """
     width = -(-size // _LANES) * _LANES
     stride = max(width, -(-(size + 2) // 8) * 8)
     square = np.zeros((size + 3) * stride, dtype=np.float32)
     template, du, dv = np.zeros((3, size * stride), dtype=np.float32)
-    half, converged_px = size // 2, _CONVERGED_PX if scale == 1.0 else _COARSELY_CONVERGED_PX
+    half, scale = size // 2, 0.5**level
+    converged_px = _CONVERGED_PX if level == 0 else _COARSELY_CONVERGED_PX
     height_limit, width_limit = second.shape[0] - size - 2.0, second.shape[1] - width - 2.0
     for k in range(len(uv)):
         is_tracked[k] = False
+        if level > levels[k]:
+            continue
         u0, v0 = uv[k, 0] * scale + border, uv[k, 1] * scale + border
         if not _sample(first, u0, v0, turn, size + 2, stride, square):
             continue

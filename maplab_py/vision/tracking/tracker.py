@@ -36,6 +36,8 @@ from maplab_py.vision.tracking.views import CameraView, leaders, usable_alone
 
 _ENOUGH_TRACKS, _CONTRADICTED_SHARE = 20, 0.3
 """The turn is looked for in the tracks when so small a share of so many of them agrees with the given one."""
+_DETECTION_FRAMES, _KEPT_SHARE = 2, 0.9
+"""Keypoints are detected in every second frame, and where fewer than this share of them is left."""
 _SAME_POINT_PX = 3.0
 """A track of a camera alone ends where a track of its leader arrives; none begins where another one is."""
 
@@ -86,12 +88,14 @@ class FrameTracker:
         self._stereo = StereoOptions(
             self._flow, self._options.epipolar_gate_px, self._options.stereo_distance_m
         )
-        self._next_id = 0
+        self._next_id = self._num_frames = 0
+        self._detected = [np.inf] * len(cameras)  # keypoints after the last detection
         self._states: tuple[_CameraState, ...] | None = None
 
     def reset(self) -> None:
         """Forget all tracks; ids continue."""
         self._states = None
+        self._detected = [np.inf] * len(self._views)
 
     def leave_out(self, cameras: frozenset[int]) -> None:
         """Look for nothing in the images of some cameras from now on, until another set is left out.
@@ -103,6 +107,7 @@ class FrameTracker:
         before, self._absent = self._leaders, cameras
         self._leaders = leaders(self._views, cameras)
         self._detectors = [self._detector(row) for row in range(len(self._views))]
+        self._detected = [np.inf] * len(self._views)
         states = list(self._states or ())
         for row, state in enumerate(states):
             tracks = state.tracks
@@ -164,11 +169,12 @@ class FrameTracker:
                     live[leader], shared = self._shared(leader, row, pair, live[leader])
                     is_apart = detection.are_apart(live[row].uv, shared.uv, _SAME_POINT_PX)
                     live[row] = live[row][is_apart]
-            if row not in self._absent:
+            if row not in self._absent and self._needs_keypoints(row, live[row], shared):
                 with watch("detect"):
                     live[row] = self._with_new(row, image.image, live[row], shared)
             output.append(self._output(row, shared, live[row]))
             matches.append(shared)
+        self._num_frames += 1
         self._states = tuple(map(_CameraState, prepared, live, matches))
         disparity_px, is_turn_only = summarise(motions)
         return TrackedImages(
@@ -235,6 +241,11 @@ class FrameTracker:
         distance = np.where(is_known, matches.distance_m, tracks.distance_m)
         return dataclasses.replace(tracks, distance_m=distance), matches
 
+    def _needs_keypoints(self, row: int, tracks: LiveTracks, shared: StereoMatches) -> bool:
+        """Tell whether to detect: in every second frame, in turn with other cameras, and after losses."""
+        is_turn = (self._num_frames + row) % _DETECTION_FRAMES == 0
+        return is_turn or len(tracks) + len(shared.uv) < _KEPT_SHARE * self._detected[row]
+
     def _with_new(
         self, row: int, image: U8, tracks: LiveTracks, shared: StereoMatches
     ) -> LiveTracks:
@@ -251,6 +262,7 @@ class FrameTracker:
         new = LiveTracks.new(uv[exists], ray[exists], self._next_id)
         new = new.compared_with(patches(image, new.uv), new.warp)
         self._next_id += len(new)
+        self._detected[row] = len(shared.uv) + len(tracks) + len(new)
         return tracks.joined(new)
 
     def _output(self, row: int, shared: StereoMatches, tracks: LiveTracks) -> CameraTracks:
@@ -387,7 +399,8 @@ def match(
     guess, visible = second.pixels((expected_m[:, None] * tracks.ray - p_A_B) @ R_A_B)
     is_due = np.isfinite(tracks.distance_m) | (tracks.num_frames % _RETRY_FRAMES == 1)
     rows = np.flatnonzero(is_due & visible & second.is_usable(guess))
-    uv, is_match = follow(*images, tracks.uv[rows], guess[rows], options.flow)
+    is_near = np.isfinite(tracks.distance_m[rows])
+    uv, is_match = follow(*images, tracks.uv[rows], guess[rows], options.flow, is_near)
     ray, exists = second.rays(uv)
     is_match &= exists & second.is_usable(uv)
     gate, distance_m = options.gate_px / second.focal_px, np.full(len(tracks), np.nan)
