@@ -31,6 +31,13 @@ def distort(kind: Distortion, parameters: F64, x: F64) -> Distorted:
     return _FORWARD[kind](parameters, x)
 
 
+def distorted(kind: Distortion, parameters: F64, x: F64) -> F64:
+    """Distort points (..., 2) of the z = 1 plane, as `distort` does."""
+    if _FORWARD[kind] is _brown:
+        return _brown(parameters, x, with_jacobians=False)[0]
+    return distort(kind, parameters, x)[0]
+
+
 def undistort(kind: Distortion, parameters: F64, x_d: F64) -> tuple[F64, Mask]:
     """Return undistorted points (..., 2) and whether they are valid (...,).
 
@@ -116,19 +123,26 @@ def _radial_factor(k: tuple[float, ...], r2: F64) -> tuple[F64, F64, F64 | float
     return s, (slope - s * (2.0 * k4 + r2 * (4.0 * k5 + 6.0 * k6 * r2))) / below, below
 
 
-def _brown(parameters: F64, x: F64) -> Distorted:
+def _tangential(p1: float, p2: float, u: F64, v: F64, r2: F64) -> F64:
+    """Return what Brown's model adds to radially distorted points (..., 2)."""
+    uv = u * v
+    along_u = 2.0 * p1 * uv + p2 * (r2 + 2.0 * u * u)
+    return np.stack([along_u, p1 * (r2 + 2.0 * v * v) + 2.0 * p2 * uv], axis=-1)
+
+
+def _brown(parameters: F64, x: F64, *, with_jacobians: bool = True) -> Distorted:
     """Brown's model, k1 k2 p1 p2 and perhaps k3 or k3 k4 k5 k6, as OpenCV orders them."""
     k = tuple(float(value) for value in parameters)
     p1, p2 = k[2:4]
     u, v = x[..., 0], x[..., 1]
     r2, uv = u * u + v * v, u * v
     s, slope, below = _radial_factor(k, r2)
+    if not with_jacobians:
+        return s[..., None] * x + _tangential(p1, p2, u, v, r2), x, x
     powers = [r2 / below, r2**2 / below, *([r2**3 / below] if len(k) > 4 else [])]
     powers += [-s * power for power in powers] if len(k) > 5 else []
     radial, J, d_radial = _radial(x, s, slope, np.stack(powers, axis=-1))
-    tangential = np.stack(
-        [2.0 * p1 * uv + p2 * (r2 + 2.0 * u * u), p1 * (r2 + 2.0 * v * v) + 2.0 * p2 * uv], axis=-1
-    )
+    tangential = _tangential(p1, p2, u, v, r2)
     J[..., 0, 0] += 2.0 * p1 * v + 6.0 * p2 * u
     J[..., 0, 1] += 2.0 * p1 * u + 2.0 * p2 * v
     J[..., 1, 0] += 2.0 * p1 * u + 2.0 * p2 * v

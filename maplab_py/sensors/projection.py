@@ -29,7 +29,7 @@ def project(camera: Camera, p_C: ArrayLike) -> tuple[F64, Mask]:
     _, focal, centre = _intrinsics(camera)
     x, _, visible = _normalise(camera, np.asarray(p_C, dtype=np.float64))
     x = np.where(visible[..., None], x, 0.0)
-    x_d, _, _ = distortion.distort(camera.distortion, camera.distortion_parameters, x)
+    x_d = distortion.distorted(camera.distortion, camera.distortion_parameters, x)
     return focal * x_d + centre, visible
 
 

@@ -114,6 +114,34 @@ def retract(T_M_I: F64, motion: F64, step: F64, new_T_M_I: F64, new_motion: F64)
 
 
 @compiled()
+def group(track: I64, rows: I64, tracks: int, order: I64, start: I64) -> None:
+    """Find the observations of some tracks (R,), those of each in a row.
+
+    Args:
+        track: Track (O,) of every observation.
+        rows: Tracks (R,).
+        tracks: Number of all tracks.
+        order: Result (O,) of which the last offset says how many are filled in.
+        start: Result (R + 1,), offsets by track.
+    """
+    place = np.full(tracks, -1, dtype=np.int64)
+    for n in range(len(rows)):
+        place[rows[n]] = n
+    start[:] = 0
+    for n in track:
+        if place[n] >= 0:
+            start[place[n] + 1] += 1
+    for n in range(len(rows)):
+        start[n + 1] += start[n]
+    filled = start[:-1].copy()
+    for n in range(len(track)):
+        at = place[track[n]]
+        if at >= 0:
+            order[filled[at]] = n
+            filled[at] += 1
+
+
+@compiled()
 def camera_poses(T_M_I: F64, T_I_C: F64, R_M_C: F64, p_M_C: F64) -> None:
     """Compute rotations (F, C, 3, 3) and positions (F, C, 3) of all cameras in all frames."""
     q, R = np.empty(4), np.empty((3, 3))

@@ -269,7 +269,8 @@ class FixedLagSmoother:
         When most are, the expectation is wrong and all stay.
         """
         tracks, newest = self.tracks, len(self._states) - 1
-        problem, _, order = self._problem(tracks.landmark_rows)
+        seen = np.flatnonzero(tracks.is_landmark & tracks.is_active)
+        problem, _, order = self._problem(seen)
         error, depth = problem.errors(self._states)
         sigma2 = tracks.observations.sigma_px[order] ** 2 + self.options.prediction_sigma_px**2
         is_new = tracks.observations.frame[order] == newest

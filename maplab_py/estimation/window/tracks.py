@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 
 from maplab_py.array_types import F64, I32, I64, Mask
+from maplab_py.estimation.kernels import window as kernels
 from maplab_py.estimation.kernels.window_arguments import WindowData
 from maplab_py.estimation.window.cameras import CameraPoses
 
@@ -132,13 +133,10 @@ class Tracks:
 
     def grouped(self, rows: I64) -> tuple[I64, I64]:
         """Return observations of some tracks (R,), track after track, and their offsets (R + 1,)."""
-        place = np.full(len(self), _NONE, dtype=np.int16)
-        place[rows] = np.arange(len(rows))
-        of_observation = place[self.observations.row]
-        order = np.argsort(of_observation, kind="stable")
-        order = order[np.count_nonzero(of_observation < 0) :]
-        counts = np.bincount(of_observation[order], minlength=len(rows))
-        return order, np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+        order = np.empty(len(self.observations), dtype=np.int64)
+        start = np.empty(len(rows) + 1, dtype=np.int64)
+        kernels.group(self.observations.row, rows, len(self), order, start)
+        return order[: start[-1]], start
 
     def data(self, rows: I64, huber_sigmas: float) -> tuple[WindowData, I64]:
         """Return what kernels read of some tracks (R,), and which observations (O',) these are."""

@@ -98,4 +98,5 @@ def _run_frames() -> None:
     chain = InertialChain(residual_kernel("inertial", sources.inertial), Imu("0" * 32))
     chain.append(1_000_000 * np.arange(2), np.ones((2, 6)), states.motion[0], is_resting=False)
     chain.relinearize(states.motion)
+    kernels.group(start, start[:1], 3, start.copy(), start.copy())
     _run_map()

@@ -15,6 +15,9 @@ _BORDER_PX = 16
 _LEVELS_OF_NEAR = 1
 """Level on which the search for keypoints begins that are expected within a few pixels."""
 
+_CONFIRMED_PX = 1.0
+"""Keypoints that arrive so near to where they were expected need not be tracked back."""
+
 
 @dataclasses.dataclass(frozen=True)
 class FlowOptions:
@@ -78,7 +81,13 @@ def follow(
         for image in (first, second)
     )
     there, is_tracked = search(first, second, uv, predicted_uv, options, is_near=is_near)
-    return there, is_tracked & is_tracked_back(first, second, uv, there, options)
+    doubtful = is_tracked.copy()
+    if is_near is not None:
+        off_px = np.abs(there - predicted_uv).max(axis=1, initial=0.0)
+        doubtful &= ~is_near | (off_px > _CONFIRMED_PX)
+    rows = np.flatnonzero(doubtful)
+    is_tracked[rows] = is_tracked_back(first, second, uv[rows], there[rows], options)
+    return there, is_tracked
 
 
 def search(

@@ -19,7 +19,15 @@ def signatures() -> dict[str, set[object]]:
     compiled = {
         name: getattr(module, name) for name in ("eliminate", "substitute", "evaluate", "unproject")
     }
-    names = ("add_factors", "add_walks", "offsets", "retract", "camera_poses", "triangulate")
+    names = (
+        "add_factors",
+        "add_walks",
+        "offsets",
+        "retract",
+        "camera_poses",
+        "triangulate",
+        "group",
+    )
     compiled |= {name: getattr(kernels, name) for name in names}
     compiled["integrate_for_residuals"] = imu.integrate_for_residuals
     for name in ("inertial", "relative_pose"):
