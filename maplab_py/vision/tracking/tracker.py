@@ -37,7 +37,7 @@ from maplab_py.vision.tracking.views import CameraView, leaders, usable_alone
 _ENOUGH_TRACKS, _CONTRADICTED_SHARE = 20, 0.3
 """The turn is looked for in the tracks when so small a share of so many of them agrees with the given one."""
 _DETECTION_FRAMES, _KEPT_SHARE = 2, 0.9
-"""Keypoints are detected in every second frame, and where fewer than this share of them is left."""
+"""Keypoints are detected in every second frame, and where at most this share of them is left."""
 _SAME_POINT_PX = 3.0
 """A track of a camera alone ends where a track of its leader arrives; none begins where another one is."""
 
@@ -244,7 +244,7 @@ class FrameTracker:
     def _needs_keypoints(self, row: int, tracks: LiveTracks, shared: StereoMatches) -> bool:
         """Tell whether to detect: in every second frame, in turn with other cameras, and after losses."""
         is_turn = (self._num_frames + row) % _DETECTION_FRAMES == 0
-        return is_turn or len(tracks) + len(shared.uv) < _KEPT_SHARE * self._detected[row]
+        return is_turn or len(tracks) + len(shared.uv) <= _KEPT_SHARE * self._detected[row]
 
     def _with_new(
         self, row: int, image: U8, tracks: LiveTracks, shared: StereoMatches
