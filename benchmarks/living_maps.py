@@ -24,25 +24,30 @@ from maplab_py.algorithms.landmarks.persistence import PersistenceOptions, exist
 from maplab_py.algorithms.localization.database import database_of_map
 from maplab_py.algorithms.localization.localization import align_robustly, localize_missions
 from maplab_py.algorithms.localization.options import LocalizationOptions
+from maplab_py.algorithms.map_update.changes import missing_regions, seen_by
 from maplab_py.algorithms.map_update.options import UpdateOptions
 from maplab_py.algorithms.map_update.thinning import choose_vertices, size_mb, thin
 from maplab_py.algorithms.map_update.update import gather, merge_session, prepare_session
 from maplab_py.algorithms.sparsification.options import SparsificationOptions
 from maplab_py.algorithms.sparsification.sparsify import sparsify
+from maplab_py.array_types import I64
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import SessionSimulator
+from maplab_py.simulation.world import World
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.edits import remove_missions
 from maplab_py.vimap.ids import IdIndex
 from maplab_py.vimap.vertex_removal import remove_vertices
 
-BUDGET_SESSIONS = 3
+BUDGET_SESSIONS, REFURBISHED = 3, 20
 NEAR_M = 0.5
 QUERY_EVERY = 5
 """Every fifth image of a session is a query."""
 BINS = 10
+LEAST_SEEN, LEAST_HITS, ON_BOX_M = 3, 2, 1e-3
+"""Landmarks of a piece of furniture that sessions saw, and that a region has, to count; and its border."""
 _PERSISTENCE = PersistenceOptions()
 
 
@@ -103,6 +108,41 @@ def calibration(vi_map: VIMap, truth: Truth, session: int) -> list[list[float]]:
     count = np.bincount(bins, minlength=BINS)
     sums = [np.bincount(bins, values, minlength=BINS) for values in (probability, exists)]
     return [[float(n), float(p), float(e)] for n, p, e in zip(count, *sums, strict=True)]
+
+
+def objects(vi_map: VIMap, truth: Truth, world: World, numbers: I64, split: int) -> dict[str, int]:
+    """Compare the changes that are reported at a refurbishment with those of the furniture and points.
+
+    Args:
+        vi_map: Map of all its sessions.
+        truth: Their truth.
+        world: The world.
+        numbers: Numbers (M,) of the sessions.
+        split: The first session after it.
+    """
+    assert world.exists is not None
+    assert world.has_box is not None
+    point = truth.point[IdIndex(truth.landmark_id).rows(vi_map.landmarks.id)]
+    good, result = (
+        vi_map.landmarks.quality == 2,
+        dict.fromkeys(("right", "wrong", "found", "all"), 0),
+    )
+    for by in (numbers >= split, numbers < split):
+        regions, _ = missing_regions(vi_map, by)
+        gone = ~world.exists[numbers[by]][:, point].any(axis=0)
+        right = sum(bool(gone[region.landmarks].mean() >= 0.5) for region in regions)
+        result["right"] += right
+        result["wrong"] += len(regions) - right
+        seen = good & gone & seen_by(vi_map, ~by)
+        before, after = world.has_box[split - 1], world.has_box[split]
+        for low, high in world.boxes[before & ~after if by[-1] else after & ~before]:
+            p = world.p_G[point]
+            mine = seen & ((p > low - ON_BOX_M) & (p < high + ON_BOX_M)).all(axis=1)
+            if np.count_nonzero(mine) >= LEAST_SEEN:
+                hits = [np.count_nonzero(mine[region.landmarks]) for region in regions]
+                result["all"] += 1
+                result["found"] += int(max(hits, default=0) >= LEAST_HITS)
+    return result
 
 
 def mean_deviation(bins: list[list[float]]) -> float:
@@ -175,6 +215,7 @@ def run(
             begin = time.process_time()
             try:
                 whole, *_ = merge_session(maps[name], session)
+                numbers = np.arange(len(whole.missions))  # where no mission was refused
             except EstimationError as error:
                 write(line | {"refused": str(error)})
                 continue
@@ -184,6 +225,8 @@ def run(
                 line["calibration"] = calibration(whole, truth, number)
             if number >= BUDGET_SESSIONS:
                 whole = METHODS[name](whole, *budget)
+            if name == "everything" and number == sessions - 1 >= REFURBISHED:
+                line["objects"] = objects(whole, truth, simulator.world, numbers, REFURBISHED)
             line["update_s"] = time.process_time() - begin
             maps[name] = whole
             write(line | {

@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from maplab_py.algorithms.map_update.options import Change
 from maplab_py.array_types import F64
 from maplab_py.errors import UserError
 from maplab_py.interop.trajectories import Trajectory
@@ -16,6 +17,7 @@ from maplab_py.viewer.extension import plugin_layers
 from maplab_py.viewer.history import State
 from maplab_py.viewer.layers import (
     cameras,
+    changes,
     closures,
     clouds,
     comparison,
@@ -55,6 +57,7 @@ class Subject:
     clouds: tuple[Cloud, ...] = ()
     segments: MarkedSegments | None = None
     localized: LocalizedRun | None = None
+    changes: tuple[Change, ...] = ()  # of a later session
     shows_observers: bool = False
     shows_sensors: bool = False  # the mounting of the sensors, and nothing of the map
     only_layers: tuple[str, ...] = ()  # visible at first; empty = the default of each layer
@@ -84,9 +87,9 @@ class Subject:
             return self.replace(state=place, other=None, arrangement="over")
         return self.replace(state=place)
 
-    def replace(self, **changes: object) -> Subject:
+    def replace(self, **exchanged: object) -> Subject:
         """Return the subject with some of it exchanged."""
-        return dataclasses.replace(self, **changes)  # type: ignore[arg-type]
+        return dataclasses.replace(self, **exchanged)  # type: ignore[arg-type]
 
 
 def build_scene(subject: Subject) -> Scene:
@@ -137,6 +140,7 @@ def scene_of(drawing: Drawing, subject: Subject) -> Scene:
     if subject.shows_observers:
         rows = _good_landmarks(drawing)
         layers.append(cameras.landmark_observers(drawing, rows, _MAX_RAYS))
+    layers += changes.change_layers(drawing, subject.changes)
     layers += clouds.layers_of_clouds(drawing, subject.clouds)
     if subject.localized is not None:
         layers += paths.localized_layers(drawing, subject.localized)

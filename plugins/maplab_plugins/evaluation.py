@@ -93,7 +93,7 @@ def compare_maps(
     if changes:
         from maplab_py.algorithms.map_update.update import changes_since
 
-        return changes_since(context.vi_map, other, progress=context.progress)
+        return changes_since(context.vi_map, other, progress=context.progress)[1]
     from maplab_py.algorithms.evaluation import map_comparison
 
     return map_comparison.compare_maps(context.vi_map, other)

@@ -59,10 +59,12 @@ def update_map(
     "gather_evidence",
     example="gather_evidence --date=2027-01-31",
     see_also=("update_map", "landmark_sparsify"),
+    reads=("session",),
 )
 def gather_evidence(
     context: CommandContext,
     *,
+    session: str = "",
     persistence: PersistenceOptions = PersistenceOptions(),
     date: str = "",
     forget: bool = False,
@@ -73,6 +75,8 @@ def gather_evidence(
     evidence instead of by observer counts.
 
     Args:
+        session: Key of a map in memory, or folder of a map, whose missions give the evidence instead of
+            those of the map: recorded by `rovioli` in it, or localised in it.
         date: Date of the probabilities that landmarks exist, as 2027-01-31; empty = the last session's.
         forget: Remove the evidence that the map has first.
     """
@@ -81,7 +85,10 @@ def gather_evidence(
 
     at_s = _seconds(date) if date else None
     vi_map = with_evidence(context.vi_map, None) if forget else context.vi_map
-    result, report = gather_all(vi_map, persistence, at_s=at_s, progress=context.progress)
+    other = map_of_key_or_folder(context, session) if session else None
+    result, report = gather_all(
+        vi_map, persistence, session=other, at_s=at_s, progress=context.progress
+    )
     context.commit(result)
     return report
 

@@ -15,31 +15,26 @@ from maplab_py.algorithms.map_update.visibility import Sightings, outcome, predi
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import UserError
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import VIMap, to_hex_list
 from maplab_py.vision.descriptors import DescriptorKind, differences
 
 _RADIUS_M = 0.5
 """Landmarks within this distance say whether the place of a landmark has changed."""
-_MIN_AROUND = 6
-"""Landmarks that say it, at least."""
-_LIKELY = 2e-3
-"""Largest probability of so many missing landmarks around one if nothing has changed."""
-_MIN_MISSING = 6
-"""Missing landmarks of a region that is reported, at least."""
-_MIN_SHARE = 0.8
-"""Share of missing landmarks around one from which its place may have changed."""
-_MIN_REGION_SHARE = 0.6
-"""Share of such landmarks among all in reach of a region, at least."""
-_MIN_PLACES = 2
-"""Places from which a landmark must have been missed."""
+_PLACES, _SESSIONS = np.array([2, 3, 4, 6, 9, 15]), 4
+"""Bounds of the numbers of places and of sessions by which the chance of a miss is counted."""
+_LEAST_CHANCE = 0.02
+_MATCHED_SHARE = 0.8
+"""Weight of matched landmarks against missing ones: those of the wall behind an object stay."""
+_EVIDENCE_AROUND, _EVIDENCE = 4.0, 5.0
+"""Least logarithm of the chance that nothing changed around a landmark, and in a whole region."""
+_MIN_MISSING, _MIN_SHARE, _MIN_REGION_SHARE = 4, 0.7, 0.7
+"""Missing landmarks of a region that is reported, at least, and their share around each and around all."""
 _MIN_EARLIER = 2
 """Earlier sessions that must have missed what counts as new: one misses much by chance."""
 _SAME_SHARE = 0.3
 """Share of a region's landmarks that look like those of another, if it has moved there."""
 _SAME_BITS = 0.2
 """Share of different bits below which two descriptors look the same."""
-_MIN_MISS_RATE = 0.2
-"""Rate of missed landmarks where nothing has changed, at least."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -48,6 +43,10 @@ class Region:
 
     landmarks: I64
     around: int  # landmarks that should have been seen there, these included
+    seen_frame: int = -1  # image that sees most of them, and one that should
+    missing_frame: int = -1
+    seen_s: int = 0  # begin of the session nearest in time that sees them, and that should
+    missing_s: int = 0
 
 
 def find_changes(vi_map: VIMap, later: Mask, progress: Progress = SILENT) -> ChangeReport:
@@ -63,9 +62,8 @@ def find_changes(vi_map: VIMap, later: Mask, progress: Progress = SILENT) -> Cha
     """
     if later.all() or not later.any():
         raise UserError("changes need earlier and later missions: all of them are on one side")
-    by_later, by_earlier = _seen_by(vi_map, later), _seen_by(vi_map, ~later)
-    vanished, missed = _missing(vi_map, np.flatnonzero(later), by_earlier, by_later, progress)
-    appeared, unseen = _missing(vi_map, np.flatnonzero(~later), by_later, by_earlier, progress)
+    vanished, missed = missing_regions(vi_map, later, progress)
+    appeared, unseen = missing_regions(vi_map, ~later, progress)
     notes = []
     if np.count_nonzero(~later) < _MIN_EARLIER:
         appeared = []
@@ -99,7 +97,7 @@ def find_changes(vi_map: VIMap, later: Mask, progress: Progress = SILENT) -> Cha
     )
 
 
-def _seen_by(vi_map: VIMap, missions: Mask) -> Mask:
+def seen_by(vi_map: VIMap, missions: Mask) -> Mask:
     """Return which landmarks (L,) missions (M,) observe."""
     keypoints = vi_map.observations
     mine = missions[vi_map.vertices.mission[vi_map.keypoint_vertex[keypoints]]]
@@ -108,54 +106,96 @@ def _seen_by(vi_map: VIMap, missions: Mask) -> Mask:
     return result
 
 
-def _missing(
-    vi_map: VIMap, missions: I64, of: Mask, seen: Mask, progress: Progress
+def missing_regions(
+    vi_map: VIMap, by: Mask, progress: Progress = SILENT
 ) -> tuple[list[Region], Mask]:
-    """Return the regions in which missions (rows) miss landmarks (L,), and all that they miss."""
+    """Return the regions that some missions (M,) miss and others see, and all landmarks that they miss."""
     count = len(vi_map.landmarks)
-    predicted, matched = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
-    for mission in missions.tolist():
+    of, seen = seen_by(vi_map, ~by), seen_by(vi_map, by)
+    predicted, matched, sessions = np.zeros((3, count), dtype=np.int64)
+    frames, landmarks = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
+    for mission in np.flatnonzero(by).tolist():
         sightings = predict(vi_map, mission, progress)
         mine = of[sightings.landmark]
         columns = (getattr(sightings, f.name)[mine] for f in dataclasses.fields(Sightings))
         session, _ = outcome(vi_map, mission, Sightings(*columns))
         predicted[session.landmark] += session.predicted
         matched[session.landmark] += session.matched
-    is_asked = of & (predicted >= _MIN_PLACES)
+        sessions[session.landmark] += 1
+        frames.append(sightings.frame[mine])
+        landmarks.append(sightings.landmark[mine])
+    is_asked = of & (predicted > 0)
     is_missed = is_asked & (matched == 0) & ~seen
-    return _regions(vi_map.p_G, np.flatnonzero(is_asked), is_missed), is_missed
+    expected = np.concatenate(frames), np.concatenate(landmarks)
+    asked = np.flatnonzero(is_asked)
+    surprise = _surprise(predicted[asked], sessions[asked], is_missed[asked])
+    regions = _regions(vi_map.p_G[asked], asked, is_missed[asked], surprise)
+    return [_with_views(vi_map, region, by, expected) for region in regions], is_missed
 
 
-def _regions(p_G: F64, asked: I64, is_missed: Mask) -> list[Region]:
+def _with_views(vi_map: VIMap, region: Region, by: Mask, expected: tuple[I64, I64]) -> Region:
+    """Return a region with the images that see most of it and that should.
+
+    Args:
+        vi_map: The map.
+        region: The region.
+        by: Missions (M,) that miss it.
+        expected: Images and landmarks (N,) that they should see.
+    """
+    times = session_times_s(vi_map)
+    mission_of = vi_map.vertices.mission[vi_map.frames.vertex]
+    keypoints = vi_map.observations[
+        np.isin(vi_map.keypoints.landmark[vi_map.observations], region.landmarks)
+    ]
+    seen = vi_map.keypoint_frame[keypoints]
+    seen = seen[~by[mission_of[seen]]]
+    missing = expected[0][np.isin(expected[1], region.landmarks)]
+    seen_s, missing_s = times[mission_of[seen]], times[mission_of[missing]]
+    is_earlier = np.median(seen_s) < np.median(missing_s)  # it vanished
+    return dataclasses.replace(
+        region,
+        seen_frame=int(np.argmax(np.bincount(seen))),
+        missing_frame=int(np.argmax(np.bincount(missing))),
+        seen_s=int(seen_s.max() if is_earlier else seen_s.min()),
+        missing_s=int(missing_s.min() if is_earlier else missing_s.max()),
+    )
+
+
+def _surprise(places: I64, sessions: I64, is_missed: Mask) -> F64:
+    """Return minus the logarithm of the chance that a landmark is missed although it is there (N,).
+
+    It is the share of missed landmarks among those that as many places and sessions should have seen.
+    """
+    group = _SESSIONS * np.digitize(places, _PLACES) + np.minimum(sessions, _SESSIONS) - 1
+    missed, every = np.bincount(group, is_missed), np.bincount(group)
+    share = (missed + 1.0) / (every + 2.0)
+    return np.asarray(-np.log(np.clip(share, _LEAST_CHANCE, 0.9))[group])
+
+
+def _regions(p_G: F64, asked: I64, is_missed: Mask, surprise: F64) -> list[Region]:
     """Return connected regions of landmarks among those asked for (N,) that are missing together."""
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
-    from scipy.stats import binom
 
     if len(asked) == 0:
         return []
-    missed = is_missed[asked]
-    tree = cKDTree(p_G[asked])
+    tree = cKDTree(p_G)
     near = tree.sparse_distance_matrix(tree, _RADIUS_M, output_type="coo_matrix").tocsr()
     near.setdiag(1.0)
     near.data[:] = 1.0
-    around = np.asarray(near.sum(axis=1)).reshape(-1)
-    missing = np.asarray(near @ missed.astype(np.float64)).reshape(-1)
-    rate = max(float(missed.mean()), _MIN_MISS_RATE)
-    chance = binom.sf(missing - 1, around, rate)
-    changed = missed & (around >= _MIN_AROUND) & (chance < _LIKELY)
-    changed &= missing >= _MIN_SHARE * around
-    rows = np.flatnonzero(changed)
+    evidence = near @ np.where(is_missed, surprise, -_MATCHED_SHARE * surprise)
+    missing, around = near @ is_missed.astype(np.float64), np.asarray(near.sum(axis=1)).reshape(-1)
+    rows = np.flatnonzero(
+        is_missed & (evidence > _EVIDENCE_AROUND) & (missing >= _MIN_SHARE * around)
+    )
     groups, label = connected_components(near[rows][:, rows], directed=False)
     regions = []
     for group in range(groups):
         inside = rows[label == group]
-        if len(inside) < _MIN_MISSING:
-            continue
-        close = np.flatnonzero(np.asarray(near[inside].sum(axis=0)).reshape(-1) > 0)
-        if len(inside) < _MIN_REGION_SHARE * len(close):
-            continue
-        regions.append(Region(asked[inside], len(close)))
+        close = np.count_nonzero(np.asarray(near[inside].sum(axis=0)).reshape(-1))
+        is_large = len(inside) >= max(_MIN_MISSING, _MIN_REGION_SHARE * close)
+        if is_large and surprise[inside].sum() >= _EVIDENCE:
+            regions.append(Region(asked[inside], int(close)))
     return regions
 
 
@@ -190,6 +230,11 @@ def _change(vi_map: VIMap, kind: str, region: Region, to: Region | None) -> Chan
     centre = np.median(p_G, axis=0)
     size = np.ptp(p_G, axis=0)
     target = None if to is None else np.median(vi_map.p_G[to.landmarks], axis=0)
+    frames = np.array([region.seen_frame, region.missing_frame])
+    dates = [f"{np.datetime64(t, 's')}"[:10] for t in (region.seen_s, region.missing_s)]
+    views = to_hex_list(vi_map.vertices.id[vi_map.frames.vertex[frames]])
+    if region.seen_s > region.missing_s:
+        dates, views = dates[::-1], views[::-1]
     return Change(
         change=kind,
         x_m=round(float(centre[0]), 2),
@@ -198,5 +243,9 @@ def _change(vi_map: VIMap, kind: str, region: Region, to: Region | None) -> Chan
         size_m=round(float(size.max()), 2),
         missing=len(region.landmarks),
         around=region.around,
+        after=dates[0],
+        until=dates[1],
         to_m="" if target is None else " ".join(f"{value:.2f}" for value in target),
+        view_before=views[0],
+        view_after=views[1],
     )

@@ -46,7 +46,11 @@ class Change:
     size_m: float
     missing: int  # landmarks that only one side saw
     around: int  # landmarks there that both should have seen
+    after: str  # dates of the sessions between which it changed
+    until: str
     to_m: str  # where it moved to, in G
+    view_before: str  # vertices whose images show it best before and after
+    view_after: str
 
 
 @dataclasses.dataclass(frozen=True)

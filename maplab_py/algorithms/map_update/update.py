@@ -1,6 +1,7 @@
 """Update a map with a session: anchor, merge, optimise, gather evidence, keep the budget."""
 
 from datetime import UTC, datetime
+from typing import Any
 
 import numpy as np
 
@@ -45,7 +46,7 @@ from maplab_py.algorithms.map_update.visibility import outcome, predict
 from maplab_py.algorithms.vi_optimization.local import optimize_around
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
-from maplab_py.array_types import I64
+from maplab_py.array_types import I64, NDArray
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import counted
@@ -208,8 +209,10 @@ def merge_session(
     return whole, merged, placed.localized
 
 
-def changes_since(vi_map: VIMap, session: VIMap, *, progress: Progress = SILENT) -> ChangeReport:
-    """Return the regions in which a session differs from a map; neither is changed.
+def changes_since(
+    vi_map: VIMap, session: VIMap, *, progress: Progress = SILENT
+) -> tuple[VIMap, ChangeReport]:
+    """Return the map with a session, and the regions in which it differs; neither is changed.
 
     Raises:
         UserError: No mission of the map is anchored, or the session is in the map.
@@ -222,13 +225,13 @@ def changes_since(vi_map: VIMap, session: VIMap, *, progress: Progress = SILENT)
         raise UserError(
             "the other map is in the selected one: --changes needs one of another session"
         )
-    # the result is a report: ids do not matter, and parts of a recording have equal ones
-    session = with_new_ids(session, content_rng(vi_map, "changes", session))
+    if shared:
+        session = with_new_ids(session, content_rng(vi_map, "changes", session))
     prepared = prepare_session(session, progress=progress)
     whole, *_ = merge_session(vi_map, prepared, progress=progress)
     later = np.zeros(len(whole.missions), dtype=np.bool_)
     later[whole.mission_index.rows(prepared.missions.id)] = True
-    return find_changes(whole, later, progress)
+    return whole, find_changes(whole, later, progress)
 
 
 def _check_anchored(vi_map: VIMap) -> None:
@@ -315,6 +318,7 @@ def gather_all(
     vi_map: VIMap,
     persistence: PersistenceOptions = _PERSISTENCE,
     *,
+    session: VIMap | None = None,
     at_s: float | None = None,
     progress: Progress = SILENT,
 ) -> tuple[VIMap, GatheringReport]:
@@ -322,26 +326,36 @@ def gather_all(
 
     Args:
         persistence: Priors of existence.
+        session: Another map, whose missions give the evidence instead; it does not come into the map.
         at_s: Time of the probabilities [s since 1970]; None = that of the last mission.
 
     Raises:
         EstimationError: The map has no descriptors.
         MapError: The evidence in the map is damaged.
     """
-    times = session_times_s(vi_map)
-    known = vi_map.baseframes.is_known[vi_map.missions.baseframe]
+    whole, chosen = vi_map, vi_map.missions.id
+    if session is not None:
+        _check_anchored(vi_map)
+        session = with_new_ids(session, content_rng(vi_map, "evidence", session))
+        prepared = prepare_session(session, progress=progress)
+        whole, *_ = merge_session(vi_map, prepared, progress=progress)
+        chosen = prepared.missions.id
+    times = session_times_s(whole)
+    known = whole.baseframes.is_known[whole.missions.baseframe]
+    known &= np.isin(np.arange(len(known)), whole.mission_index.rows(chosen))
     lines = []
     for mission in np.argsort(times, kind="stable"):
         if known[mission]:
-            vi_map, line = gather(vi_map, int(mission), persistence, progress=progress)
+            whole, line = gather(whole, int(mission), persistence, progress=progress)
             lines.append(line)
-    evidence = read_evidence(vi_map)
+    evidence = _of_landmarks(whole, vi_map)
+    vi_map = with_evidence(vi_map, evidence)
     at_s = float(times.max(initial=1)) if at_s is None else at_s
     detection = learn_detection(evidence, persistence)
     used = evidence["recent"]["time_s"][:, -1] > 0
     exists = existence(evidence[used], persistence, at_s=at_s, detection=detection)
     counts = np.histogram(exists, [0.0, 0.1, 0.5, 0.9, 1.0 + 1e-9])[0]
-    unknown = int(np.count_nonzero(~known))
+    unknown = len(chosen) - len(lines)
     note = f"without evidence, as not anchored: {counted(unknown, 'mission')}" if unknown else ""
     report = GatheringReport(
         sessions=tuple(lines),
@@ -356,6 +370,14 @@ def gather_all(
         note=note,
     )
     return vi_map, report
+
+
+def _of_landmarks(whole: VIMap, vi_map: VIMap) -> NDArray[Any]:
+    """Return the evidence of a map's landmarks (L,) in a larger map; merged ones keep theirs."""
+    evidence = read_evidence(vi_map)
+    row = whole.landmark_index.rows(vi_map.landmarks.id)
+    evidence[row >= 0] = read_evidence(whole)[row[row >= 0]]
+    return evidence
 
 
 def _date(time_s: float) -> str:

@@ -20,6 +20,7 @@ from maplab_plugins.visualization.images import (
 )
 from maplab_plugins.visualization.maps import (
     visualize,
+    visualize_changes,
     visualize_difference,
     visualize_landmark_observers,
     visualize_loop_closures,
@@ -42,6 +43,7 @@ __all__ = [
     "viewer_keep",
     "viewer_stop",
     "visualize",
+    "visualize_changes",
     "visualize_difference",
     "visualize_disparity_maps",
     "visualize_esdf",

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from maplab_plugins.visualization.following import ViewerOptions, ViewReport, show
+from maplab_plugins.evaluation import map_of_key_or_folder
+from maplab_plugins.visualization.following import ViewerOptions, ViewReport, images_of, show
 from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, Report, UserError, command
+from maplab_py.report import counted
 from maplab_py.viewer.options import PlaybackOptions, VisualizationOptions
 
 if TYPE_CHECKING:
@@ -191,6 +193,45 @@ def visualize_difference(
     missing = len(context.vi_map.vertices) + len(other.vertices) - 2 * len(here)
     mean_m, largest_m = (distance.mean(), distance.max()) if len(here) else (np.nan, np.nan)
     return DifferenceReport(name, len(here), missing, float(mean_m), float(largest_m), view)
+
+
+@command(
+    "visualize_changes",
+    example="visualize_changes tuesday",
+    see_also=("compare_maps", "update_map"),
+    acts_outside=True,
+    guards_effects=True,
+)
+def visualize_changes(
+    context: CommandContext,
+    session: str,
+    *,
+    options: VisualizationOptions = VisualizationOptions(),
+    display: ViewerOptions = ViewerOptions(),
+) -> ViewReport:
+    """Show what `compare_maps --changes` finds as boxes with dates.
+
+    A click on a date shows the images before and after the change side by side.
+
+    Args:
+        session: Key of a map in memory, or folder of a map, of a later session.
+    """
+    from maplab_py.algorithms.map_update.update import changes_since
+    from maplab_py.viewer.building import Subject
+    from maplab_py.viewer.layers.changes import ChangeImages
+
+    other = map_of_key_or_folder(context, session)
+    _, report = changes_since(context.vi_map, other, progress=context.progress)
+    folder = context.maps.get(session).folder if session in context.maps else Path(session)
+    images = ChangeImages(
+        (context.vi_map, images_of(context.vi_map, context.map_folder)),
+        (other, images_of(other, folder)),
+        report.changes,
+    )
+    count = counted(len(report.changes), "change")
+    note = f"{count} from {report.earlier} to {report.later}; {report.note}".rstrip("; ")
+    subject = Subject(context.vi_map, context.map_key, options, changes=report.changes, note=note)
+    return show(context, subject, display, image_of=images)
 
 
 def _other_state(context: CommandContext, map_key: str, snapshot: str) -> tuple[VIMap, str]:

@@ -12,12 +12,17 @@ from maplab_py.algorithms.map_update.changes import find_changes
 from maplab_py.algorithms.map_update.options import UpdateOptions
 from maplab_py.algorithms.map_update.placing import with_matches
 from maplab_py.algorithms.map_update.thinning import thin
-from maplab_py.algorithms.map_update.update import changes_since, prepare_session, update_map
+from maplab_py.algorithms.map_update.update import (
+    changes_since,
+    gather_all,
+    prepare_session,
+    update_map,
+)
 from maplab_py.console.session.session import Session
 from maplab_py.errors import MapError, UserError
 from maplab_py.simulation.scenario import ChangeOptions, SessionOptions
 from maplab_py.simulation.simulate import SimulatedData, simulate
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import VIMap, from_hex
 from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.tables import Backbone
 from tests.simulation.small import SMALL
@@ -154,10 +159,33 @@ def test_furniture_that_moves_is_a_change_and_an_unchanged_room_has_none() -> No
     before = prepare_session(maps[0])
     known = before.baseframes.replace(is_known=np.ones(1, dtype=np.bool_))
     before = before.replace(baseframes=known)
-    assert changes_since(before, maps[1]).changes == ()
+    assert changes_since(before, maps[1])[1].changes == ()
     two, _ = update_map(before, maps[1])
-    report = changes_since(two, maps[2])
+    whole, report = changes_since(two, maps[2])
+    for change in report.changes:
+        views = [from_hex(view) for view in (change.view_before, change.view_after)]
+        rows = whole.vertex_index.rows(np.array(views))
+        early, late = whole.vertices.mission[rows]
+        assert early < 2 == late
+        assert change.after <= change.until
     assert {change.change for change in report.changes} == {"vanished", "appeared"}
     assert max(change.size_m for change in report.changes) > 0.5
     with pytest.raises(UserError, match="earlier and later"):
         find_changes(two, np.zeros(2, dtype=np.bool_))
+
+
+def test_a_session_gives_evidence_without_coming_into_the_map() -> None:
+    vi_map, session = updated()[0], sessions().maps[2]
+    result, report = gather_all(vi_map, session=session)
+    assert result.missions.id.tolist() == vi_map.missions.id.tolist()
+    assert [line.date for line in report.sessions] == ["2020-11-12 12:26"]
+    assert report.sessions[0].predicted > 50
+    recent = read_evidence(result)["recent"]
+    newest = int(recent["time_s"].max())
+    assert np.count_nonzero((recent["time_s"] == newest).any(axis=1)) > 50
+    assert newest > read_evidence(vi_map)["recent"]["time_s"].max()
+    again, _ = gather_all(result, session=session)
+    for name in ("hits", "misses"):
+        np.testing.assert_array_equal(read_evidence(again)[name], read_evidence(result)[name])
+    times = read_evidence(again)["recent"]["time_s"]
+    assert not ((times[:, 1:] == times[:, :-1]) & (times[:, 1:] > 0)).any()
