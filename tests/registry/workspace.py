@@ -101,6 +101,7 @@ PREPARED["compare_maps"] = "load maps/v1_01 --map_key=before_optvi; load maps/v1
 PREPARED["update_map"] = (
     "load maps/v1_02 --map_key=tuesday; load maps/v1_01; set_mission_baseframe_to_known"
 )
+PREPARED["visualize_changes"] = PREPARED["update_map"]
 PREPARED["map_log"] = PREPARED["map_at"] = f"{PREPARED['update_map']}; update_map --session=tuesday"
 PREPARED["import_colmap"] = (
     "load maps/v1_01; export_colmap --colmap_folder=office_colmap; "
