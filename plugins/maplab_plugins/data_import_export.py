@@ -37,7 +37,7 @@ class WrittenFiles(Report):
 @command("csv_export", example="csv_export --csv_export_path=csv", writes_files=True)
 def csv_export(
     context: CommandContext,
-    csv_export_path: Path | None = None,
+    csv_export_path: Path,
     *,
     options: CsvExportOptions = CsvExportOptions(),
     export_projected_descriptor: bool = False,
@@ -89,7 +89,7 @@ def _projection(context: CommandContext, map_mission: str, file: str) -> Descrip
 )
 def csv_export_vertices_only(
     context: CommandContext,
-    csv_export_path: Path | None = None,
+    csv_export_path: Path,
     *,
     export_absolute_time: bool = False,
     map_mission: str = "",
@@ -109,7 +109,7 @@ def csv_export_vertices_only(
 
 def _export_csv(
     context: CommandContext,
-    folder: Path | None,
+    folder: Path,
     options: CsvExportOptions,
     map_mission: str,
     overwrite: bool,
@@ -119,7 +119,7 @@ def _export_csv(
 
     return export_csv_dataset(
         context.vi_map,
-        _given(folder, "csv_export_path"),
+        folder,
         options,
         missions=context.mission_rows(map_mission),
         projector=projection,
@@ -184,7 +184,7 @@ def export_trajectory_to_csv(
 )
 def export_ncamera_calibration(
     context: CommandContext,
-    ncamera_calibration_export_folder: Path | None = None,
+    ncamera_calibration_export_folder: Path,
     *,
     overwrite: bool = False,
 ) -> WrittenFiles:
@@ -199,7 +199,7 @@ def export_ncamera_calibration(
     from maplab_py.sensors.sensors_yaml import sensor_entry
     from maplab_py.sensors.yaml_text import dump_yaml
 
-    folder = _given(ncamera_calibration_export_folder, "ncamera_calibration_export_folder")
+    folder = ncamera_calibration_export_folder
     rigs = [s for s in context.vi_map.sensors.sensors.values() if isinstance(s, CameraRig)]
     if not rigs:
         raise UserError("the map has no camera rig whose calibration could be written")
@@ -218,7 +218,7 @@ def export_ncamera_calibration(
 )
 def export_mission_info(
     context: CommandContext,
-    mission_info_export_path: Path | None = None,
+    mission_info_export_path: Path,
     *,
     overwrite: bool = False,
 ) -> WrittenFiles:
@@ -232,7 +232,7 @@ def export_mission_info(
     from maplab_py.sensors.yaml_text import dump_yaml
     from maplab_py.vimap import ids
 
-    path = _given(mission_info_export_path, "mission_info_export_path")
+    path = mission_info_export_path
     info = {entry.key: ids.to_hex_list(entry.vi_map.missions.id) for entry in context.maps}
     write_text(path, [dump_yaml(info)], overwrite=overwrite)
     return WrittenFiles((path,), sum(len(missions) for missions in info.values()))
@@ -318,9 +318,3 @@ def check_recording(
     write_text(apply, [write_sensors(corrected.device.sensors)], overwrite=overwrite)
     notes = (*checked.notes, *corrected.notes)
     return dataclasses.replace(checked, sensors_file=apply, notes=notes)
-
-
-def _given(path: Path | None, flag: str) -> Path:
-    if path is None:
-        raise UserError(f"no destination: give --{flag}=...")
-    return path

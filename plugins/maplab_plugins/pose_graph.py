@@ -4,7 +4,7 @@ import dataclasses
 from pathlib import Path
 
 from maplab_py.algorithms.relaxation.options import RelaxationOptions, RelaxationReport
-from maplab_py.plugin import CommandContext, Message, UserError, command
+from maplab_py.plugin import CommandContext, Message, command
 from maplab_py.report import counted
 
 
@@ -15,7 +15,7 @@ from maplab_py.report import counted
 )
 def relax_external(
     context: CommandContext,
-    relax_external_loop_closures_file: Path | None = None,
+    relax_external_loop_closures_file: Path,
     *,
     options: RelaxationOptions = RelaxationOptions(),
     map_mission_list: str = "",
@@ -30,8 +30,6 @@ def relax_external(
     from maplab_py.algorithms.relaxation.relaxation import relax
     from maplab_py.interop.external_closures import read_external_closures
 
-    if relax_external_loop_closures_file is None:
-        raise UserError("no loop closures: give --relax_external_loop_closures_file=FILE.yaml")
     edges, notes = read_external_closures(context.vi_map, relax_external_loop_closures_file)
     result, report = relax(
         context.vi_map,

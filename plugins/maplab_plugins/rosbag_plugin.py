@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from maplab_py.interop.bags import options as bags
-from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, UserError, command
+from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, command
 
 if TYPE_CHECKING:
     from maplab_py.interop.bags.listing import BagInfo
@@ -23,8 +23,8 @@ _POSES, _EXPORT, _IMPORT = bags.PoseToBagOptions(), bags.BagExportOptions(), bag
 def pose_to_bag(
     context: CommandContext,
     *,
-    rosbag_plugin_input_bag: Path | None = None,
-    rosbag_plugin_output_bag: Path | None = None,
+    rosbag_plugin_input_bag: Path,
+    rosbag_plugin_output_bag: Path,
     options: bags.PoseToBagOptions = _POSES,
     chosen: MissionChoice = ALL_MISSIONS,
     overwrite: bool = False,
@@ -43,8 +43,8 @@ def pose_to_bag(
 
     return add_poses_to_bag(
         context.vi_map,
-        _given(rosbag_plugin_input_bag, "rosbag_plugin_input_bag"),
-        _given(rosbag_plugin_output_bag, "rosbag_plugin_output_bag"),
+        rosbag_plugin_input_bag,
+        rosbag_plugin_output_bag,
         options,
         missions=chosen.rows(context.vi_map),
         overwrite=overwrite,
@@ -174,9 +174,3 @@ def import_bag_resources(
     return context.apply(
         attach, context.mission_row(map_mission), rosbag_path, options, progress=context.progress
     )
-
-
-def _given(path: Path | None, flag: str) -> Path:
-    if path is None:
-        raise UserError(f"no bag: give --{flag}=...")
-    return path

@@ -9,7 +9,7 @@ from maplab_py.algorithms.summary.options import (
     SummaryMapReport,
 )
 from maplab_py.input_files import SizeOptions
-from maplab_py.plugin import CommandContext, UserError, check_writable, command, write_bytes
+from maplab_py.plugin import CommandContext, check_writable, command, write_bytes
 
 
 @command(
@@ -21,7 +21,7 @@ from maplab_py.plugin import CommandContext, UserError, check_writable, command,
 )
 def generate_summary_map_and_save_to_disk(
     context: CommandContext,
-    summary_map_save_path: Path | None = None,
+    summary_map_save_path: Path,
     *,
     options: SummaryMapOptions = SummaryMapOptions(),
     features: FeatureTypeOptions = FeatureTypeOptions(),
@@ -38,8 +38,6 @@ def generate_summary_map_and_save_to_disk(
     from maplab_py.algorithms.summary.summary import make_summary_map
     from maplab_py.storage.summary_map import FILE_NAME, summary_map_bytes
 
-    if summary_map_save_path is None:
-        raise UserError("no destination: give --summary_map_save_path=FOLDER")
     file = summary_map_save_path / FILE_NAME
     check_writable(file, overwrite=overwrite)
     summary = make_summary_map(
