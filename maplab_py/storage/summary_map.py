@@ -13,17 +13,20 @@ from typing import Any
 
 import numpy as np
 
-from maplab_py.array_types import F32, U32, U64
+from maplab_py.array_types import F32, U8, U32, U64
 from maplab_py.errors import MapError
 from maplab_py.output_files import check_writable, write_bytes
 from maplab_py.sensors import SensorSet, sensors_yaml
 from maplab_py.storage import maplab_map_pb2 as pb
+from maplab_py.storage.extension_fields import read_extension, with_extension
 from maplab_py.storage.protobuf import map_files, scan
 from maplab_py.vimap.descriptors import DescriptorDepth
 
 FILE_NAME = "localization_summary_map"
 
 _GZIP_LEVEL = 6
+_EXISTENCE = 1001
+"""Number of the field of `existence_percent` in the extras."""
 _UPPER_TRIANGLE = np.triu_indices(3)
 
 
@@ -43,6 +46,7 @@ class SummaryMap:
     projection: F32 | None = None  # (dimensions, bits or numbers of a descriptor)
     sensors: SensorSet | None = None
     descriptor_kind: tuple[int, int, int] | None = None  # bytes, feature type, depth; None = binary
+    existence_percent: U8 | None = None  # (L,) probability that the landmark exists
 
 
 def summary_map_file(path: Path) -> Path | None:
@@ -120,6 +124,9 @@ def _message(summary: SummaryMap) -> Any:
         extras.descriptor_kind.extend(summary.descriptor_kind)
     if summary.sensors is not None:
         extras.sensors_yaml = sensors_yaml.write_sensors(summary.sensors)
+    if summary.existence_percent is not None:
+        content = summary.existence_percent.tobytes()
+        extras.MergeFromString(with_extension(b"", _EXISTENCE, content))
     extras.sha256 = _digest(summary)
     return message
 
@@ -148,6 +155,11 @@ def _with_extras(summary: SummaryMap, extras: Any, file: Path) -> SummaryMap:
         columns["projection"] = np.ascontiguousarray(matrix)
     if extras.sensors_yaml:
         columns["sensors"] = sensors_yaml.parse_sensors(extras.sensors_yaml, f"{file}: sensors")
+    existence = read_extension(extras.SerializeToString(), _EXISTENCE)
+    if existence is not None:
+        if len(existence) != landmarks:
+            raise MapError(f"{file}: {len(existence)} probabilities of {landmarks} landmarks")
+        columns["existence_percent"] = np.frombuffer(existence, dtype=np.uint8)
     return dataclasses.replace(summary, **columns)
 
 
@@ -166,10 +178,10 @@ def _digest(summary: SummaryMap) -> bytes:
     digest = hashlib.sha256()
     for field in dataclasses.fields(summary):
         value = getattr(summary, field.name)
-        if field.name == "descriptor_kind":
+        if field.name in ("descriptor_kind", "existence_percent"):
             if value is None:
                 continue  # as in files from before there was this field
-            value = np.array(value, dtype=np.int64)
+            value = np.asarray(value, dtype=None if field.name == "existence_percent" else np.int64)
         digest.update(f"{field.name}:".encode())
         if isinstance(value, np.ndarray):
             digest.update(np.ascontiguousarray(value, value.dtype.newbyteorder("<")).tobytes())

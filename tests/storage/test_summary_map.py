@@ -33,6 +33,7 @@ def make(landmarks: int = 7, observers: int = 3, observations: int = 20) -> Summ
         landmark_covariance=(half @ half.transpose(0, 2, 1)).astype(np.float32),
         projection=rng.normal(size=(10, 64)).astype(np.float32),
         sensors=sensors(),
+        existence_percent=rng.integers(0, 101, landmarks).astype(np.uint8),
     )
 
 

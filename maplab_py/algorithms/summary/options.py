@@ -48,6 +48,7 @@ class SummaryMapContent(Report):
     has_projection: bool
     cameras: int
     median_position_sigma_m: float | None  # of landmarks, where the file has covariances
+    mean_existence: float | None  # probability that a landmark exists, where the map had evidence
     extent_m: tuple[float, float, float]  # of the observers
     megabytes: float
 

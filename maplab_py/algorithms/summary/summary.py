@@ -5,11 +5,17 @@ from pathlib import Path
 
 import numpy as np
 
+from maplab_py.algorithms.landmarks.evidence import (
+    has_evidence,
+    read_evidence,
+    session_times_s,
+)
+from maplab_py.algorithms.landmarks.persistence import PersistenceOptions, existence
 from maplab_py.algorithms.landmarks.quality import evaluate_unknown_quality
 from maplab_py.algorithms.localization.database import features_of_good_landmarks
 from maplab_py.algorithms.loop_closure.features import MapFeatures, map_features
 from maplab_py.algorithms.summary.options import SummaryMapContent, SummaryMapOptions
-from maplab_py.array_types import F32, F64, I64
+from maplab_py.array_types import F32, F64, I64, U8
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3, symmetric
 from maplab_py.progress import SILENT, Progress
@@ -92,8 +98,18 @@ def make_summary_map(
         projection=projection.matrix,
         sensors=judged.sensors,
         descriptor_kind=None if features.kind.is_binary else features.kind,
+        existence_percent=_existence_percent(judged, landmarks),
     )
     return rounded(summary, options, features.kind.projected.coarseness)
+
+
+def _existence_percent(vi_map: VIMap, landmarks: I64) -> U8 | None:
+    """Return the probability (N,) that landmarks (rows) exist; None without evidence."""
+    if not has_evidence(vi_map):
+        return None
+    now = float(session_times_s(vi_map).max())
+    exists = existence(read_evidence(vi_map), PersistenceOptions(), at_s=now)
+    return np.round(100.0 * exists[landmarks]).astype(np.uint8)
 
 
 def rounded(summary: SummaryMap, options: SummaryMapOptions, coarseness: float = 1.0) -> SummaryMap:
@@ -176,6 +192,7 @@ def describe(summary: SummaryMap, file: Path) -> SummaryMapContent:
     if summary.landmark_covariance is not None and len(summary.p_G):
         variance = np.trace(summary.landmark_covariance, axis1=1, axis2=2)
         sigma = float(np.sqrt(np.median(variance)))
+    percent = summary.existence_percent
     extent = np.ptp(summary.p_G_observer, axis=0) if len(summary.p_G_observer) else np.zeros(3)
     sensors = summary.sensors.sensors.values() if summary.sensors is not None else ()
     return SummaryMapContent(
@@ -187,6 +204,7 @@ def describe(summary: SummaryMap, file: Path) -> SummaryMapContent:
         has_projection=summary.projection is not None,
         cameras=sum(len(rig.cameras) for rig in sensors if isinstance(rig, CameraRig)),
         median_position_sigma_m=sigma,
+        mean_existence=None if percent is None else round(float(percent.mean()) / 100.0, 3),
         extent_m=(float(extent[0]), float(extent[1]), float(extent[2])),
         megabytes=file.stat().st_size * 1e-6,
     )

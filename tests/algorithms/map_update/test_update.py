@@ -2,12 +2,17 @@
 
 import dataclasses
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.landmarks.evidence import has_evidence, read_evidence
-from maplab_py.algorithms.landmarks.persistence import PersistenceOptions
+from maplab_py.algorithms.landmarks.evidence import (
+    has_evidence,
+    read_evidence,
+    session_times_s,
+)
+from maplab_py.algorithms.landmarks.persistence import PersistenceOptions, existence
 from maplab_py.algorithms.map_update.changes import find_changes
 from maplab_py.algorithms.map_update.options import UpdateOptions
 from maplab_py.algorithms.map_update.placing import with_matches
@@ -18,10 +23,13 @@ from maplab_py.algorithms.map_update.update import (
     prepare_session,
     update_map,
 )
+from maplab_py.algorithms.summary.options import SummaryMapOptions
+from maplab_py.algorithms.summary.summary import make_summary_map
 from maplab_py.console.session.session import Session
 from maplab_py.errors import MapError, UserError
 from maplab_py.simulation.scenario import ChangeOptions, SessionOptions
 from maplab_py.simulation.simulate import SimulatedData, simulate
+from maplab_py.storage.summary_map import read_summary_map, write_summary_map
 from maplab_py.vimap import VIMap, from_hex
 from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.tables import Backbone
@@ -189,3 +197,22 @@ def test_a_session_gives_evidence_without_coming_into_the_map() -> None:
         np.testing.assert_array_equal(read_evidence(again)[name], read_evidence(result)[name])
     times = read_evidence(again)["recent"]["time_s"]
     assert not ((times[:, 1:] == times[:, :-1]) & (times[:, 1:] > 0)).any()
+
+
+def test_a_summary_map_tells_the_probability_of_each_landmark(tmp_path: Path) -> None:
+    vi_map = updated()[0]
+    assert make_summary_map(first(), SummaryMapOptions()).existence_percent is None
+    summary = make_summary_map(vi_map, SummaryMapOptions(landmark_ids=True))
+    write_summary_map(summary, tmp_path)
+    again = read_summary_map(tmp_path)
+    assert again.existence_percent is not None
+    assert again.landmark_id is not None
+    rows = vi_map.landmark_index.rows(again.landmark_id)
+    now = float(session_times_s(vi_map).max())
+    exists = existence(read_evidence(vi_map), PersistenceOptions(), at_s=now)[rows]
+    assert 0.0 < exists.min() < exists.max()
+    np.testing.assert_allclose(again.existence_percent, 100.0 * exists, atol=0.5)
+    wrong = dataclasses.replace(summary, existence_percent=again.existence_percent[:-1])
+    write_summary_map(wrong, tmp_path, overwrite=True)
+    with pytest.raises(MapError, match=r"probabilities of \d+ landmarks"):
+        read_summary_map(tmp_path)
