@@ -28,6 +28,8 @@ _WAIT_SHARE = 0.1
 """Time between attempts as a share of the time that has passed since the patience ended."""
 _UNITS_PER_S, _MOST_UNITS = 900.0, 60.0
 """Units of work of an attempt for each second between frames, and the most that a frame does."""
+_ATTEMPT_FRAMES = 3.0
+"""Frames over which an attempt is spread: where it has to end by some time it begins so much earlier."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -122,9 +124,9 @@ class Initializer:
         waited_s = (frame.time_ns - (self._first_ns or 0)) * 1e-9
         leniency = min(max(waited_s / options.patience_s, 1.0), _MOST_LENIENT)
         limits = Limits(leniency * options.max_scale_sigma, leniency * options.max_tilt_sigma_deg)
-        early_s = np.inf
-        if not has_rig and waited_s < options.early_s - 5e-3:
-            early_s = options.early_s - waited_s
+        early_s, until_s = np.inf, options.early_s - _ATTEMPT_FRAMES * _interval_s(frame)
+        if not has_rig and waited_s < until_s - 5e-3:
+            early_s = until_s - waited_s
             if early_s < options.retry_s - 5e-3:
                 return None  # it would still be under way when larger deviations are allowed
             limits = dataclasses.replace(
@@ -139,8 +141,7 @@ class Initializer:
         """Do a frame's share of an attempt; return a start if it ends with one."""
         options = self._options
         newest = pending.later[-1] if pending.later else pending.frame
-        since_ns = newest.imu_times_ns[-1] - newest.imu_times_ns[0]
-        units = min(_UNITS_PER_S * since_ns * 1e-9, _MOST_UNITS)
+        units = min(_UNITS_PER_S * _interval_s(newest), _MOST_UNITS)
         with single_thread():
             attempt = pending.work.advance(units)
         if attempt is None:
@@ -156,7 +157,7 @@ class Initializer:
             return Start(pending.frame, attempt.state, later)
         waits_s = options.provisional_s
         if attempt.scale_sigma < options.provisional_scale_sigma:
-            waits_s = options.promising_s
+            waits_s = options.promising_s - _ATTEMPT_FRAMES * _interval_s(pending.frame)
         if attempt.provisional is None or pending.waited_s < waits_s - 5e-3:
             return None
         return Start(pending.frame, attempt.provisional, later, scale_sigma=attempt.scale_sigma)
@@ -172,6 +173,11 @@ class Initializer:
         since_s = pending.waited_s - options.patience_s
         wait_s = max(options.retry_s, min(0.75 * later_s, _LONGEST_WAIT_S[0]))
         return float(max(wait_s, min(_WAIT_SHARE * since_s, _LONGEST_WAIT_S[1])))
+
+
+def _interval_s(frame: WindowFrame) -> float:
+    """Return the time since the frame before."""
+    return float(frame.imu_times_ns[-1] - frame.imu_times_ns[0]) * 1e-9
 
 
 def _sees_points_twice(frame: WindowFrame) -> bool:

@@ -39,8 +39,8 @@ class InitializationOptions(Options, prefix="vio_initialization_"):
     """Largest standard deviation of the scale, as a share of it"""
     early_scale_sigma: float = option(0.015, gt=0, lt=1e6)
     """The same for a single camera before --vio_initialization_early_s has passed"""
-    early_s: float = option(3.75, gt=0, lt=1e6)
-    """Time during which a single camera waits for the better scale"""
+    early_s: float = option(3.9, gt=0, lt=1e6)
+    """Time during which a single camera waits for the better scale, its attempt included"""
     max_rig_sigma_m: float = option(0.01, gt=0, lt=1e6)
     """Cameras that see the same points need not move when the distance moved is known so well"""
     max_tilt_sigma_deg: float = option(1.5, gt=0, lt=1e6)
@@ -53,8 +53,8 @@ class InitializationOptions(Options, prefix="vio_initialization_"):
     provisional_scale_sigma: float = option(0.06, gt=0, lt=1e6)
     """Standard deviation of the scale, as a share of it, below which it waits up to
     --vio_initialization_promising_s instead"""
-    promising_s: float = option(4.0, gt=0, lt=1e6)
-    """Longest time to wait for a scale that is nearly known"""
+    promising_s: float = option(3.9, gt=0, lt=1e6)
+    """Longest time to wait for a scale that is nearly known, its attempt included"""
     max_error_px: float = option(1.5, gt=0, lt=1e6)
     """Largest median reprojection error after the refinement"""
     gyro_bias_sigma_radps: float = option(0.1, gt=0, lt=1e6)
