@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import gc
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -14,6 +13,7 @@ import numpy as np
 from maplab_py.array_types import I64, NDArray
 from maplab_py.atomic import recover
 from maplab_py.errors import MapError
+from maplab_py.memory import collection_paused
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
 from maplab_py.sensors.sensors_yaml import read_sensors
@@ -84,7 +84,7 @@ def load_map(
         recover(folder)
     budget = MemoryBudget(max_size_megabytes * 1_000_000)
     try:
-        with _no_collection():
+        with collection_paused():
             vi_map, files, total, notes = _load(folder, budget, repair, progress, listed)
     except MapError as error:
         text = str(error)
@@ -208,18 +208,6 @@ def _read_files(
                 budget.keep(path, sum(vertices.nbytes() for vertices in part.vertices))
                 parts.add(part)
     return parts
-
-
-@contextlib.contextmanager
-def _no_collection() -> Iterator[None]:
-    """Disable the garbage collector: there are very many messages and no reference cycles."""
-    was_enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_enabled:
-            gc.enable()
 
 
 def _assemble(

@@ -2,13 +2,11 @@
 
 import dataclasses
 import functools
-import gc
 import logging
 import os
 import re
 import threading
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from importlib.metadata import Distribution, EntryPoint, entry_points
 from importlib.util import find_spec
 from pathlib import Path
@@ -18,6 +16,7 @@ from maplab_py.console.commands.command import COMMAND_ATTRIBUTE, Command
 from maplab_py.console.commands.flags import CONSOLE_FLAGS, Flag
 from maplab_py.console.commands.suggest import unknown
 from maplab_py.errors import UserError
+from maplab_py.memory import collection_paused
 
 ENTRY_POINT_GROUP = "maplab_py.plugins"
 PLUGINS_VARIABLE = "MAPLAB_PLUGINS"
@@ -164,7 +163,7 @@ class Registry:
 
     def _load(self, entry: EntryPoint) -> None:
         """Load one plugin; if it fails it is listed with the reason, the traceback in the log."""
-        with self._lock, _collection_paused():
+        with self._lock, collection_paused():
             if self._pending.pop(entry.name, None) is None:
                 return
             version = _version(entry.dist) if entry.dist is not None else ""
@@ -209,18 +208,6 @@ def load_registry(entries: Iterable[EntryPoint] | None = None) -> Registry:
         )
     chosen = (e for e in installed if not names or e.name in names or e.name == ALWAYS_LOADED)
     return Registry(chosen)
-
-
-@contextmanager
-def _collection_paused() -> Iterator[None]:
-    """Pause the collection of garbage: what plugins define stays, and it is a tenth of the start."""
-    collects = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if collects:
-            gc.enable()
 
 
 def _declared_names(entry: EntryPoint) -> list[str]:
