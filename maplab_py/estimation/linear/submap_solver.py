@@ -21,6 +21,7 @@ from maplab_py.estimation.linear.single_solve import solve_backwards, solve_forw
 from maplab_py.estimation.linear.symbolic import FrontPlan, SymbolicFactor, analyse, most_below
 from maplab_py.estimation.linear.threads import single_blas_thread
 from maplab_py.memory import require_memory
+from maplab_py.vimap.table import starts_of_counts
 
 # Nested dissection puts the nodes that hold the graph together at the top of the elimination tree. Without
 # them the tree falls into two halves that share no block of the matrix, and so do the halves in turn: a
@@ -196,7 +197,7 @@ def _plan_of(plan: FrontPlan, parts: list[_Part], cutter: _Cutter) -> SubmapPlan
     order = np.array([s for part in members for s in part], dtype=np.int64)
     return SubmapPlan(
         _reordered(plan, order),
-        _offsets(np.array([len(part) for part in members], dtype=np.int64)),
+        starts_of_counts(np.array([len(part) for part in members], dtype=np.int64)),
         np.array(above, dtype=np.int64),
         tuple(part.is_submap for part in parts),
         offset,
@@ -213,7 +214,7 @@ def _reordered(plan: FrontPlan, order: I64) -> FrontPlan:
     width, below = np.diff(plan.first_node), np.diff(plan.below_start)
     new_of = np.empty(len(order), dtype=np.int64)
     new_of[order] = np.arange(len(order))
-    first_node = _offsets(width[order])
+    first_node = starts_of_counts(width[order])
     nodes = _ranges(plan.first_node[order], width[order])  # old position of every new one
     position = np.empty(len(nodes), dtype=np.int64)
     position[nodes] = np.arange(len(nodes))
@@ -223,21 +224,17 @@ def _reordered(plan: FrontPlan, order: I64) -> FrontPlan:
         node_size=d,
         order=plan.order[nodes],
         first_node=first_node,
-        below_start=_offsets(below[order]),
+        below_start=starts_of_counts(below[order]),
         below=position[plan.below[rows]],
         below_in_parent=plan.below_in_parent[rows],
         parent=np.where(above >= 0, new_of[above], -1),
-        panel_start=_offsets(((width + below) * width * d * d)[order]),
+        panel_start=starts_of_counts(((width + below) * width * d * d)[order]),
     )
-
-
-def _offsets(counts: I64) -> I64:
-    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
 
 
 def _ranges(first: I64, counts: I64) -> I64:
     """Return first[i] .. first[i] + counts[i] - 1 of every i, one after another."""
-    start = _offsets(counts)
+    start = starts_of_counts(counts)
     return np.arange(start[-1]) + np.repeat(first - start[:-1], counts)
 
 

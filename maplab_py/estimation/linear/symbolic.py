@@ -20,7 +20,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.array_types import I32, I64
 from maplab_py.compilation import compiled
@@ -28,6 +27,7 @@ from maplab_py.estimation.linear.ordering import AUTOMATIC
 from maplab_py.estimation.linear.pattern import BlockPattern, upper_columns
 from maplab_py.estimation.linear.protocol import FactorStatistics
 from maplab_py.estimation.linear.quotient_graph import inverse_order
+from maplab_py.vimap.table import starts_of_counts
 
 
 class FrontPlan(NamedTuple):
@@ -90,7 +90,7 @@ def _fronts(
     end = first_node[whole] + (step + 1) * width // count[whole]
     last = first_node[whole + 1] - 1  # the rows below a supernode are those of its last column
     outside = structure_start[last + 1] - structure_start[last]
-    below_start = _offsets(last + 1 - end + outside)
+    below_start = starts_of_counts(last + 1 - end + outside)
     below = np.empty(below_start[-1], dtype=np.int64)
     fill_below(end, last, structure_start, structure, below_start, below)
     return np.append(pieces, first_node[-1]), below_start, below
@@ -109,7 +109,7 @@ def _plan_fronts(
     rows = (width + height).astype(np.int64)
     wide, tall = (width * d).astype(np.float64), (height * d).astype(np.float64)
     flops = float(np.sum(wide**3 / 3.0 + wide**2 * tall + wide * tall**2))
-    panel_start = _offsets(rows * width * d * d)
+    panel_start = starts_of_counts(rows * width * d * d)
     in_parent = local_rows(below, np.repeat(parent, height), first_node, below_start, below)
     plan = FrontPlan(
         node_size=d,
@@ -132,12 +132,6 @@ def _plan_fronts(
             largest_front=int(rows.max(initial=0)) * d,
         ),
     )
-
-
-def _offsets(counts: NDArray[np.int64]) -> I64:
-    start = np.zeros(len(counts) + 1, dtype=np.int64)
-    np.cumsum(counts, out=start[1:])
-    return start
 
 
 @compiled()
