@@ -18,6 +18,7 @@ from maplab_py.pipeline.progress import (
     StageState,
     Watcher,
 )
+from maplab_py.storage.cache.map_cache import program_version
 
 _AGAIN = (messages.Ending.FAILED, messages.Ending.LOST)
 
@@ -82,7 +83,7 @@ class Driver:
         stages = ordered(pipeline)
         self._stages = {s.name: _Progress(s, StageState(s.name)) for s in stages}
         self._records = records.Records(settings.results)
-        self._version = fingerprint.program_version()
+        self._version = program_version()
         self._ready: deque[records.Task] = deque()
         self._alone: deque[records.Task] = deque()  # took too much memory beside others
         self._running: dict[str, records.Task] = {}

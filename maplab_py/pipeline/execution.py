@@ -19,8 +19,9 @@ from maplab_py.atomic import replaced_folder
 from maplab_py.child_processes import SECONDS_BETWEEN_LOOKS, kill, processors, start
 from maplab_py.errors import MaplabError, UserError
 from maplab_py.memory import resident_bytes, says_not_enough
-from maplab_py.pipeline import fingerprint, plan
+from maplab_py.pipeline import plan
 from maplab_py.pipeline.messages import Ending, Order, Outcome
+from maplab_py.storage.cache.map_cache import program_version
 
 _USER_ERROR = 2
 _KILLED = -9
@@ -86,9 +87,9 @@ def _check_worker(order: Order) -> None:
     Raises:
         UserError: It has another version, or does not see a folder.
     """
-    if fingerprint.program_version() != order.version:
+    if program_version() != order.version:
         raise UserError(
-            f"worker {worker_name()} has maplab-py {fingerprint.program_version()}, the pipeline was started "
+            f"worker {worker_name()} has maplab-py {program_version()}, the pipeline was started "
             f"with {order.version}: install the same version"
         )
     for folder in (order.folder, order.log.parent, *order.inputs):

@@ -1,19 +1,10 @@
 """By which contents a finished task is known."""
 
 import hashlib
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from maplab_py.errors import UserError
 from maplab_py.storage.map_saving import CARD_FILE
-
-
-def program_version() -> str:
-    """Return the version of maplab-py that is installed."""
-    try:
-        return version("maplab-py")
-    except PackageNotFoundError:  # imported from a checkout that is not installed
-        return "unknown"
 
 
 def folder_hash(folder: Path) -> str:

@@ -19,7 +19,6 @@ from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.atomic import write_file
 from maplab_py.child_processes import Service, ServiceEnded
 from maplab_py.errors import Cancelled, MapError, MaplabError, UserError
-from maplab_py.pipeline.fingerprint import program_version
 from maplab_py.pipeline.messages import Ending, Outcome
 from maplab_py.server.journal import Journal, MergedSubmap
 from maplab_py.server.options import SubmapOptions
@@ -28,6 +27,7 @@ from maplab_py.server.spool import Arrival, Entry, Spool
 from maplab_py.server.status import Events
 from maplab_py.server.worker import SubmapOrder
 from maplab_py.storage import mission_names, native
+from maplab_py.storage.cache.map_cache import program_version
 from maplab_py.vimap import VIMap, queries, to_hex
 
 _MAX_IMU_STEP_NS = 1_000_000_000

@@ -42,7 +42,8 @@ class CacheUse:
 
 
 @functools.cache
-def _program_version() -> str:
+def program_version() -> str:
+    """Return the version of maplab-py that is installed."""
     try:
         return version("maplab-py")
     except PackageNotFoundError:  # imported from a checkout that is not installed
@@ -117,7 +118,7 @@ class MapCache:
     def _facts(listing: str) -> dict[str, Any]:
         return {
             "map": hashlib.sha256(listing.encode()).hexdigest(),
-            "version of maplab-py": _program_version(),
+            "version of maplab-py": program_version(),
         }
 
     def _check(self, path: Path) -> None:
