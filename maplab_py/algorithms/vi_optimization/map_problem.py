@@ -97,30 +97,14 @@ class MapTerms:
 
     def map_problem(self, problem: Problem, held: I64, gauge: str) -> MapProblem:
         """Return the problem of these terms with the data needed to apply its solution to the map."""
-        return MapProblem(
-            self.vi_map,
-            self.selection,
-            problem,
-            self.states,
-            self.rejection,
-            self.rig,
-            self.factors,
-            held,
-            gauge,
-        )
+        return MapProblem(**vars(self), problem=problem, held=held, gauge=gauge)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class MapProblem:
+class MapProblem(MapTerms):
     """Optimisation problem of a map with the data needed to apply its solution to the map."""
 
-    vi_map: VIMap
-    selection: data_selection.Selection
     problem: Problem
-    states: States
-    rejection: OutlierRejection | None
-    rig: RigCameras | None
-    factors: MapFactors
     held: I64  # vertices that nothing constrains
     gauge: str
 
