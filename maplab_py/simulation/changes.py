@@ -42,7 +42,7 @@ def with_changes(
         builder.move_furniture(session, changes.moved_share)
         builder.replace_posters(session, changes.replaced_posters)
         if session == changes.refurbished_session:
-            builder.replace_furniture(session, changes.refurbished_share)
+            builder.move_furniture(session, changes.refurbished_share, is_new=True)
             builder.replace_posters(session, changes.refurbished_posters)
     return builder.world()
 
@@ -73,8 +73,8 @@ class _Builder:
         draw = rng.uniform(size=int(world.look.max()) + 1)
         self._light_of_look = np.where(draw < share, 0, np.where(draw < 2.0 * share, 1, -1))
 
-    def move_furniture(self, session: int, share: float) -> None:
-        """Move a share of the pieces to other places of their rooms."""
+    def move_furniture(self, session: int, share: float, *, is_new: bool = False) -> None:
+        """Move a share of the pieces to other places of their rooms, or replace them by new ones there."""
         for box in self._standing(session):
             place = self._free_place(box, session) if self._rng.uniform() < share else None
             if place is None:
@@ -82,25 +82,13 @@ class _Builder:
             shift_x, mirror = place
             points = np.flatnonzero((self._piece == box) & (self._until > session))
             flip = np.array([1.0, -1.0 if mirror else 1.0, 1.0])
-            p = self._p[points] * flip + [shift_x, 0.0, 0.0]
+            p, n = self._p[points] * flip + [shift_x, 0.0, 0.0], self._n[points] * flip
             moved = np.sort(self._boxes[box] * flip + [shift_x, 0.0, 0.0], axis=0)
-            self._replace(
-                session, points, p, self._n[points] * flip, self._look[points], moved, box
-            )
-
-    def replace_furniture(self, session: int, share: float) -> None:
-        """Replace a share of the pieces by others elsewhere in their rooms."""
-        for box in self._standing(session):
-            place = self._free_place(box, session) if self._rng.uniform() < share else None
-            if place is None:
-                continue
-            shift_x, mirror = place
-            points = np.flatnonzero((self._piece == box) & (self._until > session))
-            flip = np.array([1.0, -1.0 if mirror else 1.0, 1.0])
-            moved = np.sort(self._boxes[box] * flip + [shift_x, 0.0, 0.0], axis=0)
-            surfaces = box_surfaces(moved[0], moved[1], inwards=False)
-            p, n = scatter(surfaces, self._options, max(len(points), 1), self._rng)
-            self._replace(session, points, p, n, self._new_looks(len(p)), moved, box)
+            if is_new:
+                surfaces = box_surfaces(moved[0], moved[1], inwards=False)
+                p, n = scatter(surfaces, self._options, max(len(points), 1), self._rng)
+            look = self._new_looks(len(p)) if is_new else self._look[points]
+            self._replace(session, points, p, n, look, moved, box)
 
     def replace_posters(self, session: int, count: int) -> None:
         """Replace what hangs on round patches of the walls, `count` of them per room."""
