@@ -1,4 +1,8 @@
-"""Names of the types of arrays, one for the whole project."""
+"""Names of the types of arrays, one for the whole project, and the base of tables in memory."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,4 +17,28 @@ U8 = NDArray[np.uint8]
 I8 = NDArray[np.int8]
 Mask = NDArray[np.bool_]
 
-__all__ = ["F32", "F64", "I8", "I32", "I64", "U8", "U32", "U64", "Mask", "NDArray"]
+__all__ = ["F32", "F64", "I8", "I32", "I64", "U8", "U32", "U64", "Mask", "NDArray", "Rows"]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Rows:
+    """Base of dataclasses whose arrays share their first axis; fields that are no arrays are of all rows."""
+
+    def __len__(self) -> int:
+        return len(next(iter(self._arrays().values())))
+
+    def take(self, rows: NDArray[np.integer] | Mask | slice) -> Self:
+        """Return some of the rows."""
+        return dataclasses.replace(self, **{n: array[rows] for n, array in self._arrays().items()})
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Self]) -> Self:
+        """Return the rows of one part after another; fields that are no arrays are those of the first."""
+        rest = {field.name: getattr(parts[0], field.name) for field in dataclasses.fields(cls)}
+        arrays = {name: value for name, value in rest.items() if isinstance(value, np.ndarray)}
+        joined = {n: np.concatenate([getattr(part, n) for part in parts]) for n in arrays}
+        return cls(**{**rest, **joined})
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        values = ((field.name, getattr(self, field.name)) for field in dataclasses.fields(self))
+        return {name: value for name, value in values if isinstance(value, np.ndarray)}

@@ -103,7 +103,7 @@ def _described(
         is_described: Mask = np.ones(len(tracks), dtype=np.bool_)
     else:
         descriptors, is_described = describe(image, tracks.uv_px, tracks.scale)
-    kept = tracks[is_described]
+    kept = tracks.take(is_described)
     return TrackedFrame(
         camera=camera,
         stamp_ns=stamp_ns,

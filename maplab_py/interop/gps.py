@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64, Mask, NDArray
+from maplab_py.array_types import F64, I64, Mask, NDArray, Rows
 from maplab_py.errors import MapError, UserError
 from maplab_py.input_files import decode_foreign, read_bytes
 from maplab_py.interop.recordings import bag_files
@@ -52,7 +52,7 @@ _DAY_NS = 86_400_000_000_000
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class GpsTrack:
+class GpsTrack(Rows):
     """Fixes on WGS 84 in the order of time."""
 
     times_ns: I64  # (N,)
@@ -61,9 +61,6 @@ class GpsTrack:
     altitude_m: F64  # (N,) above the ellipsoid
     source: str
     left_out: tuple[tuple[str, int], ...] = ()  # reasons and their numbers of rows
-
-    def __len__(self) -> int:
-        return len(self.times_ns)
 
 
 def read_gps(path: Path, date: str = "", time_unit: str = "") -> GpsTrack:

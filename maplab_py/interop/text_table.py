@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64, NDArray
+from maplab_py.array_types import F64, I64, NDArray, Rows
 from maplab_py.errors import MapError
 from maplab_py.input_files import LARGEST, read_foreign_text
 from maplab_py.interop.stamps import POSES, StampKind, header_unit, parse_stamps
@@ -60,7 +60,7 @@ UNITS_OF = {
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class TextTable:
+class TextTable(Rows):
     """Rows of a text file whose first column is a time stamp."""
 
     source: str
@@ -72,15 +72,6 @@ class TextTable:
     has_commas: bool
     note: str = ""  # one line on the unit, where it was concluded against header or custom
     units: tuple[str, ...] = ()  # of the columns in `header`, "" where it tells none
-
-    def take(self, rows: NDArray[np.bool_]) -> TextTable:
-        """Return some of the rows."""
-        return dataclasses.replace(
-            self,
-            times_ns=self.times_ns[rows],
-            values=self.values[rows],
-            line_numbers=self.line_numbers[rows],
-        )
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64, Mask, NDArray
+from maplab_py.array_types import F64, I64, Mask, NDArray, Rows
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
 from maplab_py.input_files import LARGEST, read_foreign_text
@@ -60,7 +60,7 @@ _EUROC_STATE_HEADER = (
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Trajectory:
+class Trajectory(Rows):
     """Stamped poses of a body B in a reference frame R, in the order of time."""
 
     times_ns: I64  # (N,)
@@ -71,16 +71,6 @@ class Trajectory:
     source: str = ""
     note: str = ""  # one line on the unit of the stamps, where it was concluded
     has_orientation: bool = True  # else the quaternions are the identity
-
-    def __len__(self) -> int:
-        return len(self.times_ns)
-
-    def take(self, rows: I64) -> Trajectory:
-        """Return the poses of some rows."""
-        fields = ("times_ns", "T_R_B", "v_R", "gyro_bias", "accel_bias")
-        values = {name: getattr(self, name) for name in fields}
-        kept = {name: v[rows] for name, v in values.items() if v is not None}
-        return dataclasses.replace(self, **kept)
 
 
 def read_trajectory(

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, Rows
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
 from maplab_py.interop import stamps, text_table
@@ -48,7 +48,7 @@ _UNIT_TOLERANCE = 1e-2
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class WheelTrack:
+class WheelTrack(Rows):
     """Poses of the wheel sensor S in a frame O of its own, as far as the wheels know."""
 
     times_ns: I64  # (N,)
@@ -57,9 +57,6 @@ class WheelTrack:
     kind: str  # poses, motions or velocities
     source: str
     note: str = ""  # one line on the unit of the stamps, where it was concluded
-
-    def __len__(self) -> int:
-        return len(self.times_ns)
 
 
 def read_wheel_odometry(path: Path, time_unit: str = "") -> WheelTrack:

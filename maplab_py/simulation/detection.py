@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64, NDArray
+from maplab_py.array_types import F64, I64, NDArray, Rows
 from maplab_py.geometry import so3
 from maplab_py.sensors import Camera
 from maplab_py.simulation.cameras import field_of_view_radius, pixels_of
@@ -37,7 +37,7 @@ class CameraPoses:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Detections:
+class Detections(Rows):
     """Detections of one camera in all its images, sorted by image."""
 
     frame: I64  # (N,) image number

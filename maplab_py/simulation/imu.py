@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.array_types import F64, NDArray
+from maplab_py.array_types import F64, Rows
 from maplab_py.geometry import so3
 from maplab_py.sensors import ImuIntrinsics
 from maplab_py.simulation.scenario import ImuOptions
@@ -14,16 +14,12 @@ from maplab_py.simulation.spline import MotionState
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class ImuRecording:
+class ImuRecording(Rows):
     """IMU samples and their true biases."""
 
     accel_gyro: F64  # (N, 6) [ax ay az gx gy gz]
     accel_bias: F64  # (N, 3)
     gyro_bias: F64  # (N, 3)
-
-    def take(self, rows: NDArray[np.int64]) -> ImuRecording:
-        """Return the samples of a mask or rows."""
-        return ImuRecording(self.accel_gyro[rows], self.accel_bias[rows], self.gyro_bias[rows])
 
 
 def intrinsics_of(options: ImuOptions) -> ImuIntrinsics | None:

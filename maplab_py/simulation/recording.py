@@ -191,10 +191,8 @@ def _detect_all(
         tracks = max(tracks, int(track.max(initial=-1)) + 1)
         frame = detections.frame * len(cameras) + row
         parts.append(dataclasses.replace(detections, frame=frame, track=track))
-    names = [field.name for field in dataclasses.fields(detection.Detections)]
-    joined = {n: np.concatenate([getattr(part, n) for part in parts]) for n in names}
-    order = np.argsort(joined["frame"], kind="stable")
-    return detection.Detections(**{n: column[order] for n, column in joined.items()})
+    joined = detection.Detections.concatenate(parts)
+    return joined.take(np.argsort(joined.frame, kind="stable"))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from maplab_py.array_types import F32, F64, I64, U8, Mask, NDArray
 from maplab_py.simulation.detection import Detections
 from maplab_py.simulation.scenario import AppearanceOptions, ImageOptions
 from maplab_py.simulation.shading_kernels import LEVELS
-from maplab_py.simulation.surfaces import Surfaces, box_surfaces, join
+from maplab_py.simulation.surfaces import Surfaces, box_surfaces
 
 _THINNEST_M = 5e-4
 """Half the thickness of the thinnest wall that single precision does not look through."""
@@ -44,7 +44,7 @@ def make_scene(bounds: F64, boxes: F64, options: ImageOptions, rng: np.random.Ge
     half = np.maximum(half, _THINNEST_M)
     every = np.concatenate([bounds[None], np.stack([middle - half, middle + half], axis=1)])
     sides = [box_surfaces(b[0], b[1], inwards=row == 0) for row, b in enumerate(every)]
-    surfaces = join(sides)
+    surfaces = Surfaces.concatenate(sides)
     return Scene(every, surfaces, make_textures(surfaces, options, rng))
 
 

@@ -10,7 +10,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from maplab_py.array_types import F64
+from maplab_py.array_types import F64, Rows
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
 
@@ -19,7 +19,7 @@ _BLEND = np.array([[5.0, 3.0, -3.0, 1.0], [1.0, 3.0, 3.0, -2.0], [0.0, 0.0, 0.0,
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class MotionState:
+class MotionState(Rows):
     """Motion of the body I at N times, expressed in the fixed frame G unless said otherwise."""
 
     T_G_I: F64  # (N, 7)
@@ -27,12 +27,6 @@ class MotionState:
     a_G: F64  # (N, 3) [m/s^2]
     w_I: F64  # (N, 3) angular velocity in I [rad/s]
     alpha_I: F64  # (N, 3) angular acceleration in I [rad/s^2]
-
-    def take(self, rows: NDArray[np.int64]) -> MotionState:
-        """Return the motion at some of the times."""
-        return MotionState(
-            self.T_G_I[rows], self.v_G[rows], self.a_G[rows], self.w_I[rows], self.alpha_I[rows]
-        )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.array_types import F64
+from maplab_py.array_types import F64, Rows
 from maplab_py.simulation.scenario import WorldOptions
 
 _CLUSTER_SIZE_M = 0.5
@@ -15,7 +15,7 @@ _SURFACE_OFFSET_M = 1e-6
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Surfaces:
+class Surfaces(Rows):
     """Rectangles: corner + a * side_u + b * side_v with a, b in [0, 1]."""
 
     corner: F64  # (F, 3)
@@ -46,12 +46,6 @@ def box_surfaces(low: F64, high: F64, *, inwards: bool) -> Surfaces:
             sides_v.append(np.eye(3)[v] * size[v])
             normals.append(np.eye(3)[axis] * (1.0 if upper != inwards else -1.0))
     return Surfaces(np.array(corners), np.array(sides_u), np.array(sides_v), np.array(normals))
-
-
-def join(parts: list[Surfaces]) -> Surfaces:
-    """Concatenate surfaces."""
-    names = [field.name for field in dataclasses.fields(Surfaces)]
-    return Surfaces(**{n: np.concatenate([getattr(part, n) for part in parts]) for n in names})
 
 
 def scatter(

@@ -8,7 +8,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64, Mask, NDArray
 from maplab_py.simulation.scenario import WorldOptions
-from maplab_py.simulation.surfaces import Surfaces, box_surfaces, join, scatter
+from maplab_py.simulation.surfaces import Surfaces, box_surfaces, scatter
 
 _DOOR_WIDTH_M = 2.0
 _DOOR_HEIGHT_M = 2.4
@@ -175,7 +175,9 @@ def _furniture(count: int, low: F64, size: F64, rng: np.random.Generator) -> F64
 
 def _room_surfaces(low: F64, size: F64, furniture: F64) -> Surfaces:
     inside = box_surfaces(low, low + size, inwards=True)
-    return join([inside, *(box_surfaces(box[0], box[1], inwards=False) for box in furniture)])
+    return Surfaces.concatenate(
+        [inside, *(box_surfaces(box[0], box[1], inwards=False) for box in furniture)]
+    )
 
 
 def _in_doorway(p: F64, room: int, rooms: int, size: F64) -> NDArray[np.bool_]:
@@ -259,7 +261,7 @@ def _floor_surfaces(options: WorldOptions, block: F64, z_m: float) -> Surfaces:
     inner = box_surfaces(
         np.append(block[0, :2], low[2]), np.append(block[1, :2], high[2]), inwards=False
     )
-    return join([outer, _first(inner, 4)])
+    return Surfaces.concatenate([outer, _first(inner, 4)])
 
 
 def _first(surfaces: Surfaces, count: int) -> Surfaces:
@@ -436,4 +438,4 @@ def _surroundings(low: F64, high: F64, street_m: float) -> Surfaces:
         np.array([[0.0, 0.0, 1.0]]),
     )
     walls = Surfaces(facades.corner[:4], facades.side_u[:4], facades.side_v[:4], facades.normal[:4])
-    return join([walls, ground])
+    return Surfaces.concatenate([walls, ground])

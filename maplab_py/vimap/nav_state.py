@@ -7,11 +7,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, Rows
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class NavState:
+class NavState(Rows):
     """States of the IMU at N times, in the mission frame M."""
 
     time_ns: I64  # (N,)
@@ -36,12 +36,8 @@ class NavState:
     @classmethod
     def stack(cls, parts: Sequence[NavState]) -> NavState:
         """Return the states of all parts, one after another."""
-        parts = [
-            NavState.of_motion(np.zeros(0, np.int64), np.zeros((0, 7)), np.zeros((0, 9))),
-            *parts,
-        ]
-        names = [field.name for field in dataclasses.fields(NavState)]
-        return NavState(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
+        none = NavState.of_motion(np.zeros(0, np.int64), np.zeros((0, 7)), np.zeros((0, 9)))
+        return NavState.concatenate([none, *parts])
 
     @property
     def motion(self) -> F64:
@@ -50,11 +46,4 @@ class NavState:
 
     def row(self, index: int) -> NavState:
         """Return the state of one time."""
-        rows = slice(index, index + 1)
-        return NavState(
-            self.time_ns[rows], self.T_M_I[rows], self.v_M[rows], self.gyro_bias[rows],
-            self.accel_bias[rows],
-        )  # fmt: skip
-
-    def __len__(self) -> int:
-        return len(self.time_ns)
+        return self.take(slice(index, index + 1))

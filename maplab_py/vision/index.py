@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from maplab_py.array_types import F32, I8, I32, I64, U64
+from maplab_py.array_types import F32, I8, I32, I64, U64, Rows
 from maplab_py.vision.descriptors import DescriptorKind
 from maplab_py.vision.kmeans import kmeans, nearest_centre
 from maplab_py.vision.projection import learn_projection
@@ -24,7 +24,7 @@ class DescriptorColumns(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class DescriptorSet:
+class DescriptorSet(Rows):
     """Descriptors with the labels, sessions and times that restrict matches."""
 
     projected: F32  # (N, dimensions)
@@ -33,23 +33,10 @@ class DescriptorSet:
     session: I32  # (N,) mission
     time_ns: I64  # (N,)
 
-    def __len__(self) -> int:
-        return len(self.label)
-
     @property
     def columns(self) -> DescriptorColumns:
         """Bits, and what restricts matches."""
         return DescriptorColumns(self.words, self.label, self.session, self.time_ns)
-
-    def take(self, rows: I64) -> DescriptorSet:
-        """Return the descriptors of the given rows."""
-        return DescriptorSet(
-            self.projected[rows],
-            self.words[rows],
-            self.label[rows],
-            self.session[rows],
-            self.time_ns[rows],
-        )
 
 
 class MatchRule(NamedTuple):

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 
 from maplab_py.algorithms.anchoring.options import AnchoringOptions
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64, Mask, Rows
 from maplab_py.geometry import se3, yaw
 
 USED = "used"
@@ -207,7 +207,7 @@ _CONVERGED = 1e-10
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Sightings:
+class Sightings(Rows):
     """Closures between missions: vertex poses in the query's mission A and in the place's mission B."""
 
     mission_A: I64  # (N,)
@@ -215,16 +215,6 @@ class Sightings:
     T_A_I: F64  # (N, 7)
     T_B_I: F64  # (N, 7)
     weight: F64  # (N,) inliers
-
-    def take(self, rows: I64 | Mask) -> Sightings:
-        """Return the closures of a mask or rows."""
-        return Sightings(
-            self.mission_A[rows],
-            self.mission_B[rows],
-            self.T_A_I[rows],
-            self.T_B_I[rows],
-            self.weight[rows],
-        )
 
 
 def agreeing(sightings: Sightings, options: AnchoringOptions) -> tuple[F64, Mask]:

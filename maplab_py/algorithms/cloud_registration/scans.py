@@ -13,7 +13,7 @@ from maplab_py.algorithms.cloud_registration.options import CloudClosureOptions
 from maplab_py.algorithms.cloud_registration.registration import PreparedCloud, prepare_cloud
 from maplab_py.algorithms.loop_closure import closure_record, closure_table
 from maplab_py.algorithms.loop_closure.reports import Verdict
-from maplab_py.array_types import F64, I64, Mask, NDArray
+from maplab_py.array_types import F64, I64, Mask, NDArray, Rows
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import interpolation, se3
 from maplab_py.interop.ply import parse_ply
@@ -27,7 +27,7 @@ _KEPT = 400
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Scans:
+class Scans(Rows):
     """Clouds (N) of sensors, by mission and time; S is the sensor at the time of the cloud."""
 
     resource: I64  # (N,) rows
@@ -36,14 +36,6 @@ class Scans:
     vertex: I64  # (N,) row of the vertex nearest in time
     T_V_S: F64  # (N, 7) in the body frame of that vertex
     T_G_S: F64  # (N, 7)
-
-    def __len__(self) -> int:
-        return len(self.resource)
-
-    def take(self, rows: I64) -> Scans:
-        """Return some of the clouds."""
-        names = [field.name for field in dataclasses.fields(self)]
-        return Scans(**{name: getattr(self, name)[rows] for name in names})
 
 
 def map_scans(vi_map: VIMap, missions: I64, every_nth: int = 1) -> Scans:
@@ -71,8 +63,7 @@ def map_scans(vi_map: VIMap, missions: I64, every_nth: int = 1) -> Scans:
             "the map has no clouds of a sensor: import_point_clouds attaches some (clouds of cameras "
             "are not registered)"
         )
-    names = [field.name for field in dataclasses.fields(Scans)]
-    return Scans(**{n: np.concatenate([getattr(part, n) for part in parts]) for n in names})
+    return Scans.concatenate(parts)
 
 
 def _groups(owner: NDArray[np.int32], keys: NDArray[np.void]) -> list[slice]:
@@ -133,15 +124,12 @@ class CloudReader:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class CloudPairs:
+class CloudPairs(Rows):
     """Pairs (N) of clouds: the later one, or that of the later mission, is the query."""
 
     query: I64  # (N,) rows of the scans
     place: I64  # (N,)
     T_P_Q: F64  # (N, 7) initial pose of the query's sensor in that of the place; NaN = unknown
-
-    def __len__(self) -> int:
-        return len(self.query)
 
 
 def pairs_by_position(vi_map: VIMap, scans: Scans, options: CloudClosureOptions) -> CloudPairs:

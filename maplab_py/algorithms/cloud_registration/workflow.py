@@ -27,7 +27,7 @@ from maplab_py.algorithms.cloud_registration.scans import (
 from maplab_py.algorithms.loop_closure import closure_table, gates, record_updates, workflow
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.reports import Verdict
-from maplab_py.array_types import F64, I64, NDArray
+from maplab_py.array_types import F64, I64, NDArray, Rows
 from maplab_py.geometry import se3, so3
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import IdIndex, LoopClosureEdges, VIMap
@@ -138,7 +138,7 @@ _ID_OF_CLOUDS = np.uint64(0x6C696461725F6C63)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class CloudMatches:
+class CloudMatches(Rows):
     """Registered pairs (N) of clouds."""
 
     query: I64  # (N,) rows of the scans
@@ -151,9 +151,6 @@ class CloudMatches:
     constraint: F64  # (N,)
     compared: I64  # (N,) points
     agreeing: I64  # (N,) points
-
-    def __len__(self) -> int:
-        return len(self.query)
 
 
 def register_pairs(

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from maplab_py.array_types import I64, Mask, NDArray
+from maplab_py.array_types import I64, Mask, NDArray, Rows
 from maplab_py.errors import MapError
 from maplab_py.storage.extension_fields import read_extension, with_extension
 from maplab_py.vimap import VIMap
@@ -36,18 +36,13 @@ NEVER = np.float32(-1e30)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Session:
+class Session(Rows):
     """Outcome of one session for landmarks (N,)."""
 
     time_s: int  # begin, since 1970
     landmark: I64  # rows, each once
     predicted: I64  # number of places from which it should have been seen
     matched: I64  # number of places from which it was seen
-
-    def take(self, rows: I64 | Mask) -> Session:
-        """Return the outcome for some of the landmarks (rows or a mask)."""
-        columns = (self.landmark[rows], self.predicted[rows], self.matched[rows])
-        return Session(self.time_s, *columns)
 
 
 def read_evidence(vi_map: VIMap) -> NDArray[Any]:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from maplab_py.algorithms.loop_closure.features import MapFeatures
-from maplab_py.array_types import I32, I64, Mask
+from maplab_py.array_types import I32, I64, Mask, Rows
 from maplab_py.distinct import distinct
 from maplab_py.memory import require_memory
 from maplab_py.vimap import VIMap, ragged_rows, starts_of_counts
@@ -30,19 +30,12 @@ _PART_BYTES = 5e7
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Matches:
+class Matches(Rows):
     """Matches of query features with database features (rows of `MapFeatures`)."""
 
     query: I64  # (M,) sorted
     database: I64  # (M,)
     bits: I32  # (M,) different bits, or squared distance of descriptors that are not binary
-
-    def __len__(self) -> int:
-        return len(self.query)
-
-    def take(self, rows: I64 | Mask) -> Matches:
-        """Return the matches of a mask or rows."""
-        return Matches(self.query[rows], self.database[rows], self.bits[rows])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from maplab_py.algorithms.landmarks.keypoint_rays import keypoint_rays, landmark
 from maplab_py.algorithms.loop_closure import features
 from maplab_py.algorithms.loop_closure.closure_table import Closures
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.array_types import F64, I64, Mask, NDArray
+from maplab_py.array_types import F64, I64, Mask, NDArray, Rows
 from maplab_py.geometry import se3, so3, symmetric
 from maplab_py.vimap import VIMap, ragged_rows, starts_of_counts
 from maplab_py.vision.descriptors import differences
@@ -35,18 +35,13 @@ _DESCRIPTORS = 16
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class LandmarkMatches:
+class LandmarkMatches(Rows):
     """Keypoints of queries matched with landmarks (N,)."""
 
     closure: I64  # row of `Closures`
     keypoint: I64
     landmark: I64
     bits: NDArray[np.int32]  # different bits, or squared distance of other descriptors
-
-    def take(self, rows: I64 | Mask) -> LandmarkMatches:
-        """Return the matches of a mask or rows."""
-        columns = (getattr(self, field.name)[rows] for field in dataclasses.fields(self))
-        return LandmarkMatches(*columns)
 
 
 def guided_matches(

@@ -12,7 +12,7 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64, Mask, Rows
 from maplab_py.geometry import se3, so3, yaw
 from maplab_py.vimap import VIMap
 
@@ -33,7 +33,7 @@ class AgreementRule:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class PairedClosures:
+class PairedClosures(Rows):
     """Closures (N,) between missions; A is the mission with the smaller row."""
 
     mission_A: I64
@@ -62,12 +62,6 @@ class PairedClosures:
         at_A, at_B = (np.where(swapped, stretch[1 - end], stretch[end]) for end in (0, 1))
         first, second = np.minimum(*mission), np.maximum(*mission)
         return cls(first, second, T_A_I, T_B_I, way_A, way_B, at_A, at_B, weight)
-
-    def take(self, rows: I64) -> PairedClosures:
-        """Return the closures of a mask or rows."""
-        return PairedClosures(
-            *(getattr(self, field.name)[rows] for field in dataclasses.fields(self))
-        )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

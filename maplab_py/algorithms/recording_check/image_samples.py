@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64, U8, Mask
+from maplab_py.array_types import F64, I64, U8, Mask, Rows
 from maplab_py.interop.recordings.protocol import TrackedFrame
 from maplab_py.sensors import Camera
 from maplab_py.vision.features import detection, images
@@ -40,16 +40,13 @@ class ImageFigures:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class PointPairs:
+class PointPairs(Rows):
     """Points of one camera in P pairs of images; rows are padded to the same length."""
 
     first_ns: I64  # (P,)
     second_ns: I64  # (P,)
     uv_px: F64  # (P, K, 2, 2) by pair, point and image
     is_point: Mask  # (P, K)
-
-    def __len__(self) -> int:
-        return len(self.first_ns)
 
     @classmethod
     def stack(cls, pairs: list[tuple[int, int, F64]]) -> PointPairs:

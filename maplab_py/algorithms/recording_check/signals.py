@@ -8,7 +8,7 @@ import numpy as np
 
 from maplab_py.algorithms.recording_check import image_samples
 from maplab_py.algorithms.recording_check.stereo import StereoSampler
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64, Mask, Rows
 from maplab_py.errors import MapError
 from maplab_py.interop.recordings import clocks, options, protocol
 from maplab_py.interop.recordings.stream import Synchroniser
@@ -24,15 +24,12 @@ _REPEAT_EVERY = 5
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class ImuSignal:
+class ImuSignal(Rows):
     """All samples of the IMU."""
 
     times_ns: I64  # (N,)
     accel_gyro: F64  # (N, 6)
     is_saturated: Mask  # (N,)
-
-    def __len__(self) -> int:
-        return len(self.times_ns)
 
     @property
     def rate_hz(self) -> float:

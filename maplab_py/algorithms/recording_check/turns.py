@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from maplab_py.algorithms.recording_check.image_samples import PointPairs
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64, Mask, Rows
 from maplab_py.geometry import so3
 from maplab_py.sensors import Camera
 from maplab_py.vision.tracking.ray_table import RayTable
@@ -30,7 +30,7 @@ _DAMPING = 1e-6
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class RayPairs:
+class RayPairs(Rows):
     """Unit rays of the points of P pairs of images, and the times of the images."""
 
     first_ns: I64  # (P,)
@@ -40,24 +40,10 @@ class RayPairs:
     is_point: Mask  # (P, K)
     focal_px: float
 
-    def __len__(self) -> int:
-        return len(self.first_ns)
-
     @property
     def duration_s(self) -> F64:
         """Time (P,) from the first to the second image."""
         return np.asarray((self.second_ns - self.first_ns) * 1e-9)
-
-    def take(self, rows: I64 | Mask) -> RayPairs:
-        """Return some pairs."""
-        return dataclasses.replace(
-            self,
-            first_ns=self.first_ns[rows],
-            second_ns=self.second_ns[rows],
-            ray=self.ray[rows],
-            row_share=self.row_share[rows],
-            is_point=self.is_point[rows],
-        )
 
     def later(self, delay_s: float) -> RayPairs:
         """Return the pairs with later times."""

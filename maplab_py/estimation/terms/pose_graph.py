@@ -8,7 +8,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64, NDArray
+from maplab_py.array_types import F64, I64, NDArray, Rows
 from maplab_py.estimation.codegen.kernels import pose_graph_kernels
 from maplab_py.estimation.symbolic.sources import PoseError
 
@@ -33,7 +33,7 @@ class EdgeColumns(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class RelativePoses:
+class RelativePoses(Rows):
     """Measured relative poses between vertices (E edges), all with the same kind of residual e."""
 
     from_vertex: I64  # (E,) A
@@ -41,9 +41,6 @@ class RelativePoses:
     T_A_B: F64  # (E, 7)
     sqrt_information: F64  # (E, 6, 6) W of the cost |W e|^2, columns position, orientation
     error: PoseError = PoseError.SPLIT
-
-    def __len__(self) -> int:
-        return len(self.from_vertex)
 
     @property
     def kernels(self) -> ModuleType:
@@ -58,16 +55,6 @@ class RelativePoses:
             _plain(self.to_vertex),
             _plain(self.T_A_B),
             _plain(self.sqrt_information),
-        )
-
-    def take(self, rows: I64) -> RelativePoses:
-        """Return some of the edges."""
-        return RelativePoses(
-            self.from_vertex[rows],
-            self.to_vertex[rows],
-            self.T_A_B[rows],
-            self.sqrt_information[rows],
-            self.error,
         )
 
     def followed_by(self, other: RelativePoses) -> RelativePoses:

@@ -6,39 +6,19 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64, Mask, Rows
 from maplab_py.estimation.window.map_terms import MapObservations
 from maplab_py.estimation.window.tracks import Tracks
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class MapMatches:
+class MapMatches(Rows):
     """M tracks that each observe a landmark of the map; no track and no landmark occurs twice."""
 
     track_id: I64  # (M,)
     landmark: I64  # (M,) rows of the map
     p_G: F64  # (M, 3)
     covariance_G: F64 | None = None  # (M, 3, 3) [m^2]; None = landmarks are taken as exact
-
-    def __len__(self) -> int:
-        return len(self.track_id)
-
-    def take(self, rows: I64 | Mask) -> MapMatches:
-        """Return some matches."""
-        covariance = None if self.covariance_G is None else self.covariance_G[rows]
-        return MapMatches(self.track_id[rows], self.landmark[rows], self.p_G[rows], covariance)
-
-    def extended(self, other: MapMatches) -> MapMatches:
-        """Return these, then others; both or none have covariances."""
-        covariance = None
-        if self.covariance_G is not None and other.covariance_G is not None:
-            covariance = np.concatenate([self.covariance_G, other.covariance_G])
-        return MapMatches(
-            np.concatenate([self.track_id, other.track_id]),
-            np.concatenate([self.landmark, other.landmark]),
-            np.concatenate([self.p_G, other.p_G]),
-            covariance,
-        )
 
     @classmethod
     def none(cls, *, with_covariances: bool) -> MapMatches:
@@ -89,7 +69,7 @@ class MapTracks:
         is_new &= ~np.isin(matches.landmark, self.matches.landmark)
         is_new &= ~np.isin(matches.track_id, self._refused)
         added = matches.take(is_new)
-        self.matches = self.matches.extended(added)
+        self.matches = MapMatches.concatenate([self.matches, added])
         self.p_G = np.concatenate([self.p_G, added.p_G])
         return len(added)
 

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.array_types import F64, I32, I64, Mask
+from maplab_py.array_types import F64, I32, I64, Mask, Rows
 from maplab_py.estimation.kernels import window as kernels
 from maplab_py.estimation.kernels.window_arguments import WindowData
 from maplab_py.estimation.window.cameras import CameraPoses
@@ -20,8 +20,8 @@ _COLUMNS = (
 )  # fmt: skip
 
 
-@dataclasses.dataclass(eq=False)
-class Observations:
+@dataclasses.dataclass(frozen=True, eq=False)
+class Observations(Rows):
     """O observations in the order of time."""
 
     row: I64  # (O,) of the tracks
@@ -30,31 +30,6 @@ class Observations:
     uv_px: F64  # (O, 2)
     sigma_px: F64  # (O,)
     ray_C: F64  # (O, 3) unit vectors
-
-    def __len__(self) -> int:
-        return len(self.row)
-
-    def take(self, rows: I64 | Mask) -> Observations:
-        """Return some observations."""
-        return Observations(
-            self.row[rows],
-            self.frame[rows],
-            self.camera[rows],
-            self.uv_px[rows],
-            self.sigma_px[rows],
-            self.ray_C[rows],
-        )
-
-    def extended(self, other: Observations) -> Observations:
-        """Return these, then others."""
-        return Observations(
-            np.concatenate([self.row, other.row]),
-            np.concatenate([self.frame, other.frame]),
-            np.concatenate([self.camera, other.camera]),
-            np.concatenate([self.uv_px, other.uv_px]),
-            np.concatenate([self.sigma_px, other.sigma_px]),
-            np.concatenate([self.ray_C, other.ray_C]),
-        )
 
 
 class Tracks:
@@ -102,7 +77,7 @@ class Tracks:
         self.last_seen[row] = self._clock + 1 + frame - frames.start
         self._clock += len(frames)
         new = dataclasses.replace(seen, row=row, frame=frame).take(~self.is_closed[row])
-        self.observations = self.observations.extended(new)
+        self.observations = Observations.concatenate([self.observations, new])
 
     def counts(self) -> I64:
         """Return the number of observations (T,)."""
@@ -225,8 +200,9 @@ class Tracks:
             self.is_landmark[rows] = False
         self.remove_observations(is_removed, poses)
         self._forget()
-        seen = self.observations
-        seen.frame = np.where(seen.frame > frame, seen.frame - 1, seen.frame).astype(np.int32)
+        seen = self.observations.frame
+        seen = np.where(seen > frame, seen - 1, seen).astype(np.int32)
+        self.observations = dataclasses.replace(self.observations, frame=seen)
         later = self.anchor_frame > frame
         self.anchor_frame[later] -= 1
 
@@ -263,7 +239,9 @@ class Tracks:
             order = np.argsort(np.concatenate([self.id, ids]), kind="stable")
             place = np.empty_like(order)
             place[order] = np.arange(len(order))
-            self.observations.row = place[self.observations.row]
+            self.observations = dataclasses.replace(
+                self.observations, row=place[self.observations.row]
+            )
         count = len(ids)
         added = {
             "id": ids,
@@ -284,6 +262,8 @@ class Tracks:
         kept = (self.counts() > 0) | (self.is_closed & (self.last_seen > self._clock - _MEMORY))
         if kept.all():
             return
-        self.observations.row = (np.cumsum(kept) - 1)[self.observations.row]
+        self.observations = dataclasses.replace(
+            self.observations, row=(np.cumsum(kept) - 1)[self.observations.row]
+        )
         for name in _COLUMNS:
             setattr(self, name, getattr(self, name)[kept])

@@ -9,7 +9,7 @@ import numpy as np
 
 from maplab_py.algorithms.landmarks.keypoint_rays import bearings
 from maplab_py.algorithms.localization.localizer import Query
-from maplab_py.array_types import F64, I32, I64, U8, Mask
+from maplab_py.array_types import F64, I32, I64, U8, Mask, Rows
 from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.frontend.vertex_keypoints import described_frames
 from maplab_py.geometry import so3
@@ -18,7 +18,7 @@ from maplab_py.vimap.descriptors import FeatureType
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class FrameKeypoints:
+class FrameKeypoints(Rows):
     """N keypoints with descriptors of all cameras of one frame."""
 
     time_ns: int
@@ -29,9 +29,6 @@ class FrameKeypoints:
     origin_I: F64  # (N, 3) camera centres in the body frame [m]
     ray_I: F64  # (N, 3) unit rays in the body frame
     rad_per_px: F64  # (N,) angle that a pixel covers
-
-    def __len__(self) -> int:
-        return len(self.track_id)
 
     def query(self, q_M_I: F64) -> Query:
         """Return the query of all keypoints, with the attitude (4,) of the body."""

@@ -10,7 +10,7 @@ import dataclasses
 from collections.abc import Iterator
 from typing import Protocol
 
-from maplab_py.array_types import F64, I32, I64, U8, Mask
+from maplab_py.array_types import F64, I32, I64, U8, Mask, Rows
 from maplab_py.interop.device import RecordedSensors as RecordedSensors
 from maplab_py.interop.images import CONTAINER_BITS, Pixels, as_grey
 from maplab_py.sensors import Imu
@@ -18,7 +18,7 @@ from maplab_py.vimap.descriptors import DescriptorDepth, FeatureType
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class ImuBatch:
+class ImuBatch(Rows):
     """Consecutive IMU samples, at least one, in the order of time."""
 
     times_ns: I64  # (N,)
@@ -30,16 +30,10 @@ class ImuBatch:
         """Make a batch; saturation follows from the limits of the IMU."""
         return cls(times_ns, accel_gyro, imu.is_saturated(accel_gyro))
 
-    def __len__(self) -> int:
-        return len(self.times_ns)
-
     @property
     def time_ns(self) -> int:
         """Time of the first sample."""
         return int(self.times_ns[0])
-
-    def __getitem__(self, rows: slice) -> ImuBatch:
-        return ImuBatch(self.times_ns[rows], self.accel_gyro[rows], self.is_saturated[rows])
 
 
 class ImageData(Protocol):

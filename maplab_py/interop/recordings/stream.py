@@ -220,9 +220,9 @@ class Synchroniser:
         for batch in self._held:
             count = int(np.searchsorted(batch.times_ns, time_ns, side="right"))
             if count:
-                yield batch[:count]
+                yield batch.take(slice(count))
             if count < len(batch):
-                later.append(batch[count:])
+                later.append(batch.take(slice(count, None)))
         self._held = []
         yield protocol.FrameSet(time_ns, images)
         yield from later

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from maplab_py.array_types import F32, F64, I64, U8, Mask
+from maplab_py.array_types import F32, F64, I64, U8, Mask, Rows
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3
 from maplab_py.sensors import Camera, Distortion, Projection
@@ -114,7 +114,7 @@ class FrameTracker:
             if row in cameras:
                 tracks = LiveTracks.none()
             elif before[row] != row and self._leaders[row] == row:
-                tracks = tracks.joined(self._alone(row, state))
+                tracks = LiveTracks.concatenate([tracks, self._alone(row, state)])
             states[row] = dataclasses.replace(state, tracks=tracks)
         self._states = tuple(states) if states else None
 
@@ -168,7 +168,7 @@ class FrameTracker:
                     pair = prepared[leader], image
                     live[leader], shared = self._shared(leader, row, pair, live[leader])
                     is_apart = detection.are_apart(live[row].uv, shared.uv, _SAME_POINT_PX)
-                    live[row] = live[row][is_apart]
+                    live[row] = live[row].take(is_apart)
             if row not in self._absent and self._needs_keypoints(row, live[row], shared):
                 with watch("detect"):
                     live[row] = self._with_new(row, image.image, live[row], shared)
@@ -229,7 +229,7 @@ class FrameTracker:
                 if np.mean(free.is_inlier) > 1.0 - _CONTRADICTED_SHARE:
                     motion = free  # the gyroscope is wrong, or the camera has been knocked
             rows = rows[motion.is_inlier]
-        tracks = tracks.compared_with(aligned.patch, aligned.warp)[rows]
+        tracks = tracks.compared_with(aligned.patch, aligned.warp).take(rows)
         return tracks.at(aligned.uv[rows], ray[rows]), motion
 
     def _shared(
@@ -263,7 +263,7 @@ class FrameTracker:
         new = new.compared_with(patches(image, new.uv), new.warp)
         self._next_id += len(new)
         self._detected[row] = len(shared.uv) + len(tracks) + len(new)
-        return tracks.joined(new)
+        return LiveTracks.concatenate([tracks, new])
 
     def _output(self, row: int, shared: StereoMatches, tracks: LiveTracks) -> CameraTracks:
         options = self._options
@@ -412,7 +412,7 @@ def match(
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class LiveTracks:
+class LiveTracks(Rows):
     """Tracks at the latest image of a camera."""
 
     uv: F64  # (K, 2) of the prepared image
@@ -422,19 +422,6 @@ class LiveTracks:
     distance_m: F64  # (K,) along the ray, NaN = unknown
     patch: F32  # (K, S, S) about the keypoint in an earlier image
     warp: F64  # (K, 2, 2) from offsets in the patch to offsets in the latest image
-
-    def __len__(self) -> int:
-        return len(self.track_id)
-
-    def __getitem__(self, rows: Mask | I64) -> LiveTracks:
-        columns = (getattr(self, field.name)[rows] for field in dataclasses.fields(self))
-        return LiveTracks(*columns)
-
-    def joined(self, others: LiveTracks) -> LiveTracks:
-        """Return these tracks followed by others."""
-        names = [field.name for field in dataclasses.fields(self)]
-        pairs = ((getattr(self, name), getattr(others, name)) for name in names)
-        return LiveTracks(*(np.concatenate(pair) for pair in pairs))
 
     def at(self, uv: F64, ray: F64) -> LiveTracks:
         """Return the tracks an image later."""

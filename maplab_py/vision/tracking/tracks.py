@@ -6,11 +6,11 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64, Rows
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class CameraTracks:
+class CameraTracks(Rows):
     """Tracked keypoints of one camera of a frame set."""
 
     uv_px: F64  # (K, 2) of the distorted image
@@ -18,13 +18,6 @@ class CameraTracks:
     sigma_px: F64  # (K,)
     scale: F64  # (K,) diameter [px] of what a descriptor sees, OpenCV's KeyPoint.size
     num_frames: I64  # (K,) frame sets that have seen the track so far, this one included
-
-    def __len__(self) -> int:
-        return len(self.track_id)
-
-    def __getitem__(self, rows: Mask | I64) -> CameraTracks:
-        columns = (getattr(self, field.name)[rows] for field in dataclasses.fields(self))
-        return CameraTracks(*columns)
 
     @classmethod
     def empty(cls) -> CameraTracks:
