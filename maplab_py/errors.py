@@ -1,5 +1,8 @@
 """The one exception tree. A message is one line for the user: what is wrong, where, and the remedy."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class MaplabError(Exception):
     """Root of every error that this project raises on purpose.
@@ -37,3 +40,12 @@ class EstimationError(MaplabError):
 
 class Cancelled(MaplabError):
     """The user cancelled the running command (exit status 130)."""
+
+
+@contextmanager
+def os_errors_as(kind: type[MaplabError], what: str) -> Iterator[None]:
+    """Raise an error that says what failed, with the reason of the operating system in brackets."""
+    try:
+        yield
+    except OSError as error:
+        raise kind(f"{what} ({error.strerror})") from error

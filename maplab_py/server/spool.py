@@ -27,7 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from maplab_py.atomic import move_folder, system, write_file
-from maplab_py.errors import MapError, UserError
+from maplab_py.errors import MapError, UserError, os_errors_as
 from maplab_py.pipeline.fingerprint import folder_hash
 from maplab_py.storage import checksums, native
 from maplab_py.storage.resources.store import MAP_FOLDER
@@ -306,10 +306,8 @@ def locked_spool(spool: Spool) -> Iterator[None]:
     Raises:
         UserError: Another process holds it, or it cannot be made.
     """
-    try:
+    with os_errors_as(UserError, f"{spool.lock}: cannot be locked"):
         descriptor = system.opened_locked(spool.lock)
-    except OSError as error:
-        raise UserError(f"{spool.lock}: cannot be locked ({error.strerror})") from error
     if descriptor is None:
         raise UserError(
             f"--spool={spool.root}: another server{_process(spool)} works on it; stop it with "

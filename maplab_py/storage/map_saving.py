@@ -13,7 +13,7 @@ from google.protobuf.message import Message
 
 from maplab_py.atomic import link_or_copy, recover, replaced_folder
 from maplab_py.cancellation import check_cancelled
-from maplab_py.errors import UserError
+from maplab_py.errors import UserError, os_errors_as
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
 from maplab_py.sensors import CameraRig, Distortion, sensors_yaml
@@ -142,7 +142,7 @@ def check_target(
     Raises:
         UserError: It holds a map that must not be replaced, or something else than a map.
     """
-    try:
+    with os_errors_as(UserError, f"{folder}: cannot be read"):
         if not folder.exists():
             return
         if not folder.is_dir():
@@ -159,8 +159,6 @@ def check_target(
             )
         elif not known and not overwrite:
             raise UserError(f"{folder} holds a map already; use --{flag} to replace it")
-    except OSError as error:
-        raise UserError(f"{folder}: cannot be read ({error.strerror})") from error
 
 
 def check_parent(folder: Path) -> None:

@@ -5,7 +5,7 @@ import time
 from pathlib import Path
 
 from maplab_py.atomic import recover
-from maplab_py.errors import MapError
+from maplab_py.errors import MapError, os_errors_as
 from maplab_py.progress import SILENT, Progress
 from maplab_py.storage import checksums, map_loading
 from maplab_py.storage.cache.map_cache import MapCache
@@ -149,10 +149,8 @@ def find_maps(folder: Path) -> list[Path]:
     if is_map_folder(folder):
         return [folder]
     folders: list[Path] = []
-    try:
+    with os_errors_as(MapError, f"{folder}: cannot be read"):
         below = sorted(folder.iterdir()) if folder.is_dir() else []
-    except OSError as error:
-        raise MapError(f"{folder}: cannot be read ({error.strerror})") from error
     for path in below:
         if path.is_dir() and not path.name.startswith("."):
             folders += find_maps(path)

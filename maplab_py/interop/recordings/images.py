@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from maplab_py.errors import MapError
+from maplab_py.errors import MapError, os_errors_as
 from maplab_py.input_files import read_bytes
 from maplab_py.interop import images as pixel_data
 from maplab_py.interop.recordings.protocol import CameraImage
@@ -113,10 +113,8 @@ def image_file(path: Path, camera: Camera) -> EncodedImage:
     """Return the image of a file."""
 
     def read() -> bytes:
-        try:
+        with os_errors_as(MapError, f"{path}: the image cannot be read"):
             return read_bytes(path, _MAX_FILE_BYTES, remedy="it is no image", error=MapError)
-        except OSError as error:
-            raise MapError(f"{path}: the image cannot be read ({error.strerror})") from error
 
     return EncodedImage(str(path), camera, read)
 

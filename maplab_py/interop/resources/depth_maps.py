@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from maplab_py.array_types import F32, NDArray
-from maplab_py.errors import MapError, UserError
+from maplab_py.errors import MapError, UserError, os_errors_as
 from maplab_py.input_files import read_bytes
 from maplab_py.interop.resources import matching
 from maplab_py.options import Options, option
@@ -110,10 +110,8 @@ def _read_depth(path: Path, camera: Camera, scale: float) -> F32:
     """Return the depths (H, W) [m] of a file."""
     import cv2
 
-    try:
+    with os_errors_as(MapError, f"{path}: the depth image cannot be read"):
         data = read_bytes(path, _MAX_FILE_BYTES, remedy="it is no depth image", error=MapError)
-    except OSError as error:
-        raise MapError(f"{path}: the depth image cannot be read ({error.strerror})") from error
     flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_UNCHANGED
     pixels: Any = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags) if data else None
     if pixels is None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from maplab_py.array_types import I64
-from maplab_py.errors import UserError
+from maplab_py.errors import UserError, os_errors_as
 from maplab_py.geometry.interpolation import nearest_rows
 from maplab_py.report import Report
 from maplab_py.sensors import CameraRig
@@ -68,10 +68,8 @@ def stamped_files(folder: Path, suffixes: tuple[str, ...], flag: str) -> tuple[I
     Raises:
         UserError: The folder cannot be read, or has no such file, or a name is no stamp.
     """
-    try:
+    with os_errors_as(UserError, f"{flag}={folder}: the folder cannot be read"):
         files = [path for path in folder.iterdir() if path.suffix.lower() in suffixes]
-    except OSError as error:
-        raise UserError(f"{flag}={folder}: the folder cannot be read ({error.strerror})") from error
     if not files:
         raise UserError(f"{flag}={folder}: there are no files <time stamp>{'|'.join(suffixes)}")
     for path in sorted(files):

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from maplab_py.array_types import I64, U8, NDArray
-from maplab_py.errors import MapError, UserError
+from maplab_py.errors import MapError, UserError, os_errors_as
 from maplab_py.input_files import DEFAULT_MAX_BYTES, read_bytes
 from maplab_py.interop.ply import EmptyCloud, PlyCloud, encode_ply, parse_ply
 from maplab_py.interop.resources.matching import ImportedResources, stamped_files
@@ -245,10 +245,8 @@ def read_cloud(path: Path) -> PlyCloud:
     Raises:
         MapError: It cannot be read, is damaged or has no points.
     """
-    try:
+    with os_errors_as(MapError, f"{path}: the cloud cannot be read"):
         data = read_bytes(path, DEFAULT_MAX_BYTES, remedy="split it", error=MapError)
-    except OSError as error:
-        raise MapError(f"{path}: the cloud cannot be read ({error.strerror})") from error
     parse = parse_pcd if path.suffix.lower() == ".pcd" else parse_ply
     cloud = parse(data, str(path))
     valid = np.isfinite(cloud.p).all(axis=1)

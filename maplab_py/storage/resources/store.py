@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.atomic import replaced_file
-from maplab_py.errors import MapError
+from maplab_py.errors import MapError, os_errors_as
 from maplab_py.storage.resources.types import resource_type
 from maplab_py.vimap import Resources, VIMap, to_hex
 
@@ -81,10 +81,8 @@ class ResourceStore:
 
 
 def _read(path: Path) -> tuple[Any, int]:
-    try:
+    with os_errors_as(MapError, f"{path}: the resource cannot be read"):
         data = path.read_bytes()
-    except OSError as error:
-        raise MapError(f"{path}: the resource cannot be read ({error.strerror})") from error
     if path.suffix in _IMAGE_SUFFIXES:
         import cv2
 
@@ -193,10 +191,8 @@ class ResourceCache:
         Raises:
             MapError: The file cannot be read.
         """
-        try:
+        with os_errors_as(MapError, f"{path}: the resource cannot be read"):
             status = path.stat()
-        except OSError as error:
-            raise MapError(f"{path}: the resource cannot be read ({error.strerror})") from error
         state = status.st_mtime_ns, status.st_size
         with self._lock:
             counts = self._counts.setdefault(kind, [0, 0])

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from maplab_py.array_types import F64, U8
-from maplab_py.errors import MapError, UserError
+from maplab_py.errors import MapError, UserError, os_errors_as
 from maplab_py.input_files import read_bytes
 from maplab_py.sensors import Camera
 from maplab_py.vision.features.options import FeatureOptions
@@ -101,12 +101,8 @@ def _mask(camera: Camera, number: int, options: FeatureOptions) -> U8 | None:
     name = names[0]
     if not name:
         return None
-    try:
+    with os_errors_as(UserError, f"--rovio_image_mask_path: {name} cannot be read"):
         data = read_bytes(Path(name), _MAX_MASK_BYTES, remedy="it is no image", error=UserError)
-    except OSError as error:
-        raise UserError(
-            f"--rovio_image_mask_path: {name} cannot be read ({error.strerror})"
-        ) from error
     image = (
         cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
     )

@@ -19,7 +19,7 @@ from maplab_py.algorithms.self_calibration.device import with_device_of
 from maplab_py.algorithms.self_calibration.segments.splitting import extract_submap
 from maplab_py.array_types import F64, I64
 from maplab_py.atomic.system import opened_locked
-from maplab_py.errors import MaplabError, UserError
+from maplab_py.errors import MaplabError, UserError, os_errors_as
 from maplab_py.input_files import DEFAULT_MAX_BYTES, RAISE_THE_BOUND, read_npz
 from maplab_py.output_files import write_bytes
 from maplab_py.sensors import SensorSet, sensors_yaml
@@ -201,13 +201,11 @@ def locked_database(path: Path | None) -> Iterator[None]:
         yield
         return
     lock, until_s = path.with_name(path.name + ".lock"), time.monotonic() + _SECONDS_TO_WAIT
-    try:
+    with os_errors_as(UserError, f"{lock}: cannot be locked"):
         while (descriptor := opened_locked(lock)) is None:
             if time.monotonic() > until_s:
                 raise UserError(f"{path}: another process has worked on it for minutes; stop that")
             time.sleep(_SECONDS_BETWEEN_TRIES)
-    except OSError as error:
-        raise UserError(f"{lock}: cannot be locked ({error.strerror})") from error
     try:
         yield
     finally:

@@ -23,7 +23,7 @@ import numpy as np
 
 from maplab_py.array_types import F32, F64, U8
 from maplab_py.child_processes import SECONDS_BETWEEN_LOOKS, kill, start
-from maplab_py.errors import UserError
+from maplab_py.errors import UserError, os_errors_as
 from maplab_py.input_files import read_bytes
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
@@ -142,10 +142,8 @@ def _download(folder: Path, progress: Progress) -> Path:
 
 
 def _read(path: Path) -> bytes:
-    try:
+    with os_errors_as(UserError, f"--weights={path}: cannot be read"):
         return read_bytes(path, _MAX_BYTES, remedy="it is no checkpoint of XFeat")
-    except OSError as error:
-        raise UserError(f"--weights={path}: cannot be read ({error.strerror})") from None
 
 
 def _is_wheel(content: bytes) -> bool:
