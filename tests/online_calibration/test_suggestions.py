@@ -23,10 +23,17 @@ from maplab_py.simulation.simulate import simulate
 from tests.online_calibration.recorded import device_scenario
 
 
-def test_three_suggestions_teach_more_than_three_everyday_segments() -> None:
-    """From a straight walk; the bar of both factors is on the least known parameter."""
-    straight = MotionOptions(kind="straight", duration_s=8.0, speed_mps=0.3)
-    database, _ = collect(simulate(device_scenario(straight)).maps[0], OPTIONS)
+@pytest.mark.parametrize(
+    "poor",
+    [
+        MotionOptions(kind="straight", duration_s=8.0, speed_mps=0.3),
+        MotionOptions(kind="rotation", duration_s=8.1, turns=0.4),
+    ],
+    ids=lambda poor: poor.kind,
+)
+def test_three_suggestions_teach_more_than_three_everyday_segments(poor: MotionOptions) -> None:
+    """The bar of both factors is on the least known parameter."""
+    database, _ = collect(simulate(device_scenario(poor)).maps[0], OPTIONS)
     report = suggest_motion(database, OPTIONS, WantedSigmas())
     assert len(report.suggestions) == 3
     assert not report.sufficient
