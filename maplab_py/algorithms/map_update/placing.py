@@ -13,6 +13,7 @@ from maplab_py.algorithms.localization.database import database_of_map
 from maplab_py.algorithms.localization.localization import queries, query_vertices
 from maplab_py.algorithms.localization.localizer import Localizer, Outcome
 from maplab_py.algorithms.localization.options import LocalizationOptions
+from maplab_py.algorithms.map_update.visibility import main_feature_type
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, yaw
@@ -45,7 +46,7 @@ def place(vi_map: VIMap, session: VIMap, progress: Progress = SILENT) -> Placed:
         EstimationError: One of them has no descriptors, or the map no good landmark.
     """
     known = np.flatnonzero(vi_map.baseframes.is_known[vi_map.missions.baseframe])
-    database = database_of_map(vi_map, missions=known)
+    database = database_of_map(vi_map, missions=known, feature_type=main_feature_type(vi_map))
     if database.landmark is None:
         raise EstimationError("the landmarks of the map are not known")
     source = query_vertices(session, np.arange(len(session.missions)), database.projection)
@@ -78,7 +79,8 @@ def place(vi_map: VIMap, session: VIMap, progress: Progress = SILENT) -> Placed:
     return Placed(
         np.array(missions, dtype=np.int64),
         np.array(aligned).reshape(-1, 7),
-        *joined,
+        joined[0],
+        joined[1],
         len(rows) / max(len(source.vertex), 1),
     )
 

@@ -42,7 +42,7 @@ from maplab_py.algorithms.map_update.options import (
 )
 from maplab_py.algorithms.map_update.placing import Placed, place, with_matches
 from maplab_py.algorithms.map_update.thinning import size_mb, thin
-from maplab_py.algorithms.map_update.visibility import outcome, predict
+from maplab_py.algorithms.map_update.visibility import main_feature_type, outcome, predict
 from maplab_py.algorithms.vi_optimization.local import optimize_around
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
@@ -166,7 +166,9 @@ def _localized(vi_map: VIMap, session: VIMap, progress: Progress) -> float:
     known[vi_map.mission_index.rows(session.missions.id)] = False
     if not known.any():
         return 0.0
-    database = database_of_map(vi_map, missions=np.flatnonzero(known))
+    database = database_of_map(
+        vi_map, missions=np.flatnonzero(known), feature_type=main_feature_type(vi_map)
+    )
     localized = localize_missions(database, session, LocalizationOptions(), progress=progress)
     return float(localized.is_localized.mean())
 

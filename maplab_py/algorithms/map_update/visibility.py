@@ -18,7 +18,7 @@ from maplab_py.distinct import distinct
 from maplab_py.geometry import se3, so3
 from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors.projection import project
-from maplab_py.vimap import LandmarkQuality, VIMap, starts_of_counts
+from maplab_py.vimap import FeatureType, LandmarkQuality, VIMap, starts_of_counts
 from maplab_py.vision.descriptors import differences
 
 _RADIUS_PX = 8.0
@@ -120,6 +120,12 @@ def outcome(vi_map: VIMap, mission: int, sightings: Sightings) -> tuple[Session,
     return Session(time_s, rows, predicted[rows], matched[rows]), rate
 
 
+def main_feature_type(vi_map: VIMap) -> int:
+    """Return the type of most descriptors of a map; binary if it has none."""
+    types = vi_map.feature_type[vi_map.feature_type >= 0]
+    return int(np.argmax(np.bincount(types))) if len(types) else int(FeatureType.BINARY)
+
+
 class _Search:
     """Data of the map that the searches in all images of a mission use."""
 
@@ -135,7 +141,7 @@ class _Search:
         self._is_old &= vi_map.landmarks.quality == LandmarkQuality.GOOD
         self._old = np.flatnonzero(self._is_old)
         every = np.ones(len(vi_map.frames), dtype=np.bool_)
-        kind, self._described = most_frequent_kind(vi_map, every, options.type_number)
+        kind, self._described = most_frequent_kind(vi_map, every, main_feature_type(vi_map))
         self._words = kind.comparable(
             np.ascontiguousarray(vi_map.keypoints.descriptor[:, : kind.size])
         )

@@ -26,12 +26,14 @@ from maplab_py.algorithms.map_update.update import (
 from maplab_py.algorithms.summary.options import SummaryMapOptions
 from maplab_py.algorithms.summary.summary import make_summary_map
 from maplab_py.console.session.session import Session
-from maplab_py.errors import MapError, UserError
+from maplab_py.errors import EstimationError, MapError, UserError
 from maplab_py.simulation.scenario import ChangeOptions, SessionOptions
 from maplab_py.simulation.simulate import SimulatedData, simulate
 from maplab_py.storage.summary_map import read_summary_map, write_summary_map
-from maplab_py.vimap import VIMap, from_hex
+from maplab_py.vimap import FeatureType, VIMap, from_hex
 from maplab_py.vimap.consistency import check_consistency
+from maplab_py.vimap.descriptors import DescriptorBlock, DescriptorDepth
+from maplab_py.vimap.table import object_column
 from maplab_py.vimap.tables import Backbone
 from tests.simulation.small import SMALL
 
@@ -216,3 +218,33 @@ def test_a_summary_map_tells_the_probability_of_each_landmark(tmp_path: Path) ->
     write_summary_map(wrong, tmp_path, overwrite=True)
     with pytest.raises(MapError, match=r"probabilities of \d+ landmarks"):
         read_summary_map(tmp_path)
+
+
+def with_floats(vi_map: VIMap) -> VIMap:
+    """Return a map with descriptors of 64 numbers instead of 384 bits."""
+    bits = np.unpackbits(vi_map.keypoints.descriptor, axis=1) - 0.5
+    numbers = bits @ np.random.default_rng(0).normal(size=(bits.shape[1], 64))
+    numbers /= np.linalg.norm(numbers, axis=1, keepdims=True)
+    kind = (256, DescriptorDepth.FLOAT32, FeatureType.XFEAT)
+    blocks = object_column(
+        [
+            tuple(DescriptorBlock(b.keypoints, *kind) for b in row)
+            for row in vi_map.frames.descriptor_blocks
+        ]
+    )
+    return vi_map.replace(
+        frames=vi_map.frames.replace(descriptor_blocks=blocks),
+        keypoints=vi_map.keypoints.replace(descriptor=numbers.astype(np.float32).view(np.uint8)),
+        landmarks=vi_map.landmarks.replace(
+            feature_type=np.full(len(vi_map.landmarks), FeatureType.XFEAT)
+        ),
+    )
+
+
+def test_descriptors_may_be_numbers() -> None:
+    vi_map, report = update_map(with_floats(first()), with_floats(sessions().maps[1]))
+    assert check_consistency(vi_map).errors == ()
+    assert report.sessions[0].matched >= 20
+    assert report.sessions[0].false_match < 0.1
+    with pytest.raises(EstimationError, match="descriptors"):
+        update_map(first(), with_floats(sessions().maps[1]))
