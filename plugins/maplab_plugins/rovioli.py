@@ -7,7 +7,7 @@ import functools
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from maplab_py.cancellation import ending_early
 from maplab_py.frontend.run_options import DataSourceOptions, RunOptions
@@ -34,7 +34,9 @@ if TYPE_CHECKING:
     from maplab_py.interop.recordings.protocol import Recording
     from maplab_py.online_calibration.beside import CalibrationBeside
     from maplab_py.server.submap_sources import SubmapWriter
+    from maplab_py.viewer.building import Subject
     from maplab_py.viewer.display.viewer import Viewer
+    from maplab_py.vimap import VIMap
 
 _DEFAULT_KEY = "rovioli"
 _SECONDS_TO_DRAW = 20.0
@@ -274,7 +276,6 @@ class _Pictures:
     def after_frame(self, update: OdometryUpdate, mapping: Mapping) -> None:
         """Take the landmarks of a frame, and show everything when it is time."""
         from maplab_py.frontend.live_map import live_map, picture_of_tracks
-        from maplab_py.viewer.building import Subject
         from maplab_py.viewer.layers.paths import LocalizedRun
 
         if update.mission != self._mission:
@@ -297,7 +298,7 @@ class _Pictures:
                 vi_map, run = live_map(mapping.builder, self._landmarks, live.T_G_M), None
                 if localization is not None and live.T_G_M is not None:
                     run = LocalizedRun(localization.p_G, live.p_G_I, live.rays_G)
-                self._viewer.follow(Subject(vi_map, self._title, localized=run))
+                self._viewer.follow(self._subject(vi_map, localized=run))
 
     def after_run(self, finished: FinishedRun, keep_in: CommandContext | None = None) -> None:
         """Show the finished map, and how to come back to it; wait, for the program may end now.
@@ -309,16 +310,26 @@ class _Pictures:
             keep_in: Keep the viewer in this context until Ctrl-C.
         """
         from maplab_plugins.visualization.output import keep
-        from maplab_py.viewer.building import Subject
 
         vi_map, folder = finished.vi_map, finished.report.map_folder
         is_stopped = self._viewer.is_stopped
         if vi_map is not None and self._localized.T_G_M is None and not is_stopped:
             note = "finished; in memory only: save" if folder is None else f"saved: load {folder}"
-            self._viewer.follow(Subject(vi_map, self._title, note=note))
+            self._viewer.follow(self._subject(vi_map, note=note))
             self._viewer.wait(_SECONDS_TO_DRAW)
         if keep_in is not None and not is_stopped:
             keep(keep_in, self._viewer)
+
+    def _subject(self, vi_map: VIMap, **more: Any) -> Subject:
+        """Return the map to show, in the colours that were chosen in the page."""
+        from maplab_plugins.visualization.following import in_colours
+        from maplab_py.viewer.building import Subject
+
+        shown = self._viewer.wanted
+        subject = Subject(vi_map, self._title, **more)
+        if shown is None or shown.title != self._title:
+            return in_colours(subject)
+        return subject.replace(options=shown.options)
 
 
 def _pictures(context: CommandContext, title: str, interval_s: float) -> _Pictures:

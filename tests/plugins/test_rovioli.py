@@ -326,9 +326,17 @@ def test_the_viewer_follows(walk: Path, monkeypatch: pytest.MonkeyPatch) -> None
     from maplab_py.viewer.display.viewer import Viewer
 
     followed: list[tuple[int, int]] = []
+    colourings: list[str] = []
+    really_follow = Viewer.follow
 
     def follow(viewer: Viewer, subject: Subject) -> None:
         followed.append((len(subject.vi_map.vertices), len(subject.vi_map.landmarks)))
+        colourings.append(subject.options.landmark_colouring)
+        really_follow(viewer, subject)
+        if len(followed) == 3:  # as a user in the page
+            really_follow(
+                viewer, subject.replace(options=subject.options.with_colouring("quality"))
+            )
 
     monkeypatch.setattr(Viewer, "pages", property(lambda _: 1))
     monkeypatch.setattr(Viewer, "follow", follow)
@@ -341,3 +349,4 @@ def test_the_viewer_follows(walk: Path, monkeypatch: pytest.MonkeyPatch) -> None
     assert vertices[0] == 2
     assert vertices[-1] == report.vertices
     assert followed[-1][1] > 100
+    assert colourings == 3 * ["height"] + (len(colourings) - 3) * ["quality"]

@@ -133,8 +133,8 @@ class Selection:
         if self._widgets is not None:
             self._widgets.show((), None, "")
 
-    def show_image(self, image: U8) -> None:
-        """Show an image (H, W, 3) that is not of the pick."""
+    def show_image(self, image: U8 | None) -> None:
+        """Show an image (H, W, 3) that is not of the pick, or none."""
         if self._widgets is not None:
             self._widgets.show_image(image)
 
@@ -294,8 +294,8 @@ class Selections:
         for selection in (self._general, *self.pages.values()):
             selection.is_measuring = is_measuring
 
-    def show_image(self, image: U8) -> None:
-        """Show an image (H, W, 3) in all pages, as of a recording that runs."""
+    def show_image(self, image: U8 | None) -> None:
+        """Show an image (H, W, 3), or none, in all pages, as of a recording that runs."""
         with self._lock:
             self._live = image
             for selection in self.pages.values():

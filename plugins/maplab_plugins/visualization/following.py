@@ -122,7 +122,7 @@ def _with_history(context: CommandContext, subject: Subject) -> Subject:
     return subject.replace(history=states_of(entry))
 
 
-def _in_colours(subject: Subject) -> Subject:
+def in_colours(subject: Subject) -> Subject:
     """Return the subject in the colours that say most of a single mission, unless others are asked for.
 
     Landmarks have those of their pixels, without images those of their height; the path has those of time.
@@ -186,7 +186,7 @@ def viewer_for_output(context: CommandContext) -> Iterator[Viewer]:
     try:
         images = images_of(context.vi_map, context.map_folder)
         subject = Subject(context.vi_map, context.map_key, images=images)
-        viewer.show(_with_history(context, _in_colours(subject)))
+        viewer.show(_with_history(context, in_colours(subject)))
         yield viewer
     finally:
         viewer.stop()
@@ -244,7 +244,7 @@ def show(
         )
     viewer = ensure_viewer(context, viewer_options)
     check_cancelled()
-    subject = _with_history(context, _in_colours(subject.replace(images=images)))
+    subject = _with_history(context, in_colours(subject.replace(images=images)))
     viewer.show(subject, playback=playback)
     if plays:
         viewer.open_time_line()
