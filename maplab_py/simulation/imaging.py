@@ -16,6 +16,7 @@ from maplab_py.simulation.cameras import pixels_of
 from maplab_py.simulation.ray_caster import RayCaster
 from maplab_py.simulation.scenario import ImageOptions, SessionImages
 from maplab_py.simulation.shading_kernels import FAST, PaintedBoxes
+from maplab_py.simulation.walkers import Walkers
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -28,6 +29,7 @@ class Imager:
     line_delay_s: float
     at_time: Callable[[F64], F64]  # poses T_G_C (N, 7) at times (N,) [s]
     vignette: F32  # (H, W)
+    walkers: Walkers | None = None
 
     @classmethod
     def of(
@@ -38,6 +40,7 @@ class Imager:
         line_delay_s: float,
         at_time: Callable[[F64], F64],
         brightness: Brightness,
+        walkers: Walkers | None = None,
     ) -> Self:
         """Invert the camera model once for all images."""
         centre = np.array([camera.width_px, camera.height_px]) / 2.0
@@ -46,7 +49,7 @@ class Imager:
         vignette = (1.0 - options.vignette * radius2).astype(np.float32)
         focal_px = float(np.mean(camera.central_focal_px))
         caster = RayCaster.of(painted, pixel_rays(camera), focal_px)
-        return cls(caster, options, brightness, line_delay_s, at_time, vignette)
+        return cls(caster, options, brightness, line_delay_s, at_time, vignette, walkers)
 
     def image(self, time_s: float, rng: np.random.Generator) -> tuple[U8, F32]:
         """Return the image (H, W) taken about a time, and the depth (H, W) [m] at that time.
@@ -61,10 +64,14 @@ class Imager:
         T_G_C = self.at_time((row_s + shifts_s[:, None]).ravel()).reshape(samples, -1, 7)
         light = np.zeros(shape, dtype=np.float32)
         depth, any_depth = np.zeros_like(light), np.zeros_like(light)
+        caster = self.caster
+        if self.walkers is not None:
+            moved = self.walkers.moved(caster.painted, time_s)
+            caster = dataclasses.replace(caster, painted=moved)
         for number in range(samples):
             # the middle sample lies nearest to the image's time
             far = depth if number == samples // 2 else any_depth
-            self.caster.add(T_G_C[number], 1.0 / samples, light, far)
+            caster.add(T_G_C[number], 1.0 / samples, light, far)
         noise = rng.standard_normal(shape, dtype=np.float32)
         image = np.empty(shape, dtype=np.uint8)
         gain, sigma = np.float32(self.brightness.at(time_s)), np.float32(options.noise_sigma)

@@ -26,13 +26,15 @@ from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors import Camera, Distortion, Imu, Projection
 from maplab_py.simulation import imaging, ray_caster, reports, shading_kernels
 from maplab_py.simulation.scenario import Scenario
-from maplab_py.simulation.scene import make_scene
+from maplab_py.simulation.scene import Scene, make_scene
 from maplab_py.simulation.session import wheel_velocities, write_wheel_velocities
 from maplab_py.simulation.simulate import RecordedSession, SimulatedData, simulate
 from maplab_py.simulation.surfaces import Surfaces
+from maplab_py.simulation.walkers import Walkers
+from maplab_py.simulation.world import World
 from maplab_py.storage.native import save_map
 
-_SCENE_STREAM, _REPAINT_STREAM, _WHEEL_STREAM = 21, 24, 25
+_SCENE_STREAM, _REPAINT_STREAM, _WHEEL_STREAM, _WALKER_STREAM = 21, 24, 25, 26
 _PROJECTION_NAMES = {
     Projection.PINHOLE: "pinhole",
     Projection.UNIFIED: "omni",
@@ -68,8 +70,7 @@ def write_raw_data(
     """
     scene = None
     if scenario.images.render:
-        rng = np.random.default_rng([scenario.seeds.world, _SCENE_STREAM])
-        scene = make_scene(data.world.bounds, data.world.boxes, scenario.images, rng)
+        scene = _scene(scenario, data.world, np.zeros((0, 2, 3)))
         truth_folder = folder / "truth"
         truth_folder.mkdir(parents=True, exist_ok=True)
         write_mesh(scene.surfaces, truth_folder / "mesh.ply")
@@ -92,11 +93,29 @@ def write_raw_data(
         if scene is not None:
             rng = np.random.default_rng([scenario.seeds.appearance, _REPAINT_STREAM, number])
             share = scenario.sessions[number].images.repainted_share
-            painted = ray_caster.painted_boxes(scene.repainted(share, rng))
+            walkers = _walkers(scenario, number, session, float(data.world.bounds[0, 2]))
+            crowded = scene if walkers is None else _scene(scenario, data.world, walkers.boxes)
+            painted = ray_caster.painted_boxes(crowded.repainted(share, rng))
             to = SessionFolders(target / "mav0", truth)
-            write_images(scenario, number, session, painted, to, progress=progress)
+            write_images(scenario, number, session, painted, to, walkers, progress=progress)
         folders.append(target)
     return folders
+
+
+def _scene(scenario: Scenario, world: World, walkers: F64) -> Scene:
+    """Paint a world; boxes (W, 2, 3) beside it do not change how the others look."""
+    rng = np.random.default_rng([scenario.seeds.world, _SCENE_STREAM])
+    return make_scene(world.bounds, np.concatenate([world.boxes, walkers]), scenario.images, rng)
+
+
+def _walkers(
+    scenario: Scenario, number: int, session: RecordedSession, floor_m: float
+) -> Walkers | None:
+    images = scenario.sessions[number].images
+    if not images.walkers:
+        return None
+    rng = np.random.default_rng([scenario.seeds.motion, _WALKER_STREAM, number])
+    return Walkers.of(images, session.recording.spline, floor_m, rng)
 
 
 def _write_session(
@@ -197,6 +216,7 @@ def write_images(
     session: RecordedSession,
     painted: shading_kernels.PaintedBoxes,
     folders: SessionFolders,
+    walkers: Walkers | None = None,
     *,
     threads: int | None = None,
     progress: Progress = SILENT,
@@ -209,6 +229,7 @@ def write_images(
         session: What was recorded, with the true motion and cameras.
         painted: The scene as this session sees it.
         folders: Where the images go.
+        walkers: The last boxes of the scene; None = none of them moves.
         threads: How many images are rendered at a time; None = as many as there are processors.
 
     Raises:
@@ -225,7 +246,9 @@ def write_images(
     )
     for row, camera in enumerate(session.device.true_rig.cameras):
         at_time, delay = _camera_motion(session, row), scenario.cameras[row].line_delay_s
-        imager = imaging.Imager.of(painted, camera, scenario.images, delay, at_time, brightness)
+        imager = imaging.Imager.of(
+            painted, camera, scenario.images, delay, at_time, brightness, walkers
+        )
         targets = folders.images / f"cam{row}" / "data", folders.depths / f"depth{row}"
         for target in targets[: 1 + scenario.images.depth]:
             target.mkdir(exist_ok=True)

@@ -242,6 +242,11 @@ def _check_session(scenario: sim.Scenario, session: sim.SessionOptions, key: str
         raise UserError(f"{key}.duration_s: too short for two frames")
     if session.total_s * scenario.imu.rate_hz > _MOST_SAMPLES:
         raise UserError(f"{key}.duration_s: gives more than {_MOST_SAMPLES} IMU samples")
+    images = session.images
+    if images.walkers_until_s and images.walkers_until_s <= images.walkers_from_s:
+        raise UserError(f"{key}.images.walkers_until_s: must be after walkers_from_s, or 0")
+    if images.walkers and not scenario.images.render:
+        raise UserError(f"{key}.images.walkers: needs images.render: true")
     if session.trajectory:
         return
     if session.recorded_imu or session.keep_frame:

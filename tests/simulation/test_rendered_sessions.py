@@ -16,6 +16,7 @@ from maplab_py.simulation import imaging, raw_data, ray_caster, scenario_file
 from maplab_py.simulation import scenario as sim
 from maplab_py.simulation.scene import Scene, make_scene
 from maplab_py.simulation.simulate import SimulatedData, simulate
+from maplab_py.simulation.walkers import Walkers
 
 CAMERA = sim.CameraOptions(
     intrinsics=(95.0, 95.0, 94.0, 60.0), width_px=188, height_px=120, position_m=(0.05, 0.06, 0.0)
@@ -88,6 +89,52 @@ def test_without_jumps_the_gain_is_constant() -> None:
     random = np.random.default_rng(0)
     brightness = imaging.make_brightness(sim.SessionImages(light=0.7), 0.0, 60.0, random)
     assert {brightness.at(time) for time in np.linspace(0.0, 60.0, 100)} == {0.7}
+
+
+# -- walkers --------------------------------------------------------------------------------------
+
+
+def test_walkers_cross_the_view_while_they_are_wanted(tmp_path: Path) -> None:
+    greys: list[list[np.ndarray]] = []
+    depths: list[list[np.ndarray]] = []
+    times_s = np.zeros(0)
+    for walkers in (0, 3):
+        images = sim.SessionImages(
+            walkers=walkers, walkers_from_s=0.5, walkers_until_s=3.0, repainted_share=0.1
+        )
+        session = dataclasses.replace(FLIGHT.sessions[0], duration_s=4.0, images=images)
+        scenario = dataclasses.replace(FLIGHT, sessions=(session,))
+        simulated = simulate(scenario)
+        raw_data.write_raw_data(scenario, simulated, tmp_path / str(walkers))
+        times_s = simulated.recordings[0].recording.frame_s
+        folder = tmp_path / str(walkers) / "truth" / "session_1" / "depth0"
+        depths.append([cv2.imread(str(file), -1) for file in sorted(folder.iterdir())])
+        files = sorted((tmp_path / str(walkers) / "raw/session_1/mav0/cam0/data").iterdir())
+        greys.append([cv2.imread(str(file), -1) for file in files])
+    for row, time_s in enumerate(times_s):
+        is_walker = depths[0][row] != depths[1][row]
+        assert (depths[1][row][is_walker] < depths[0][row][is_walker]).all()
+        far = cv2.dilate(is_walker.astype(np.uint8), np.ones((9, 9))) == 0
+        assert np.abs(greys[0][row].astype(int) - greys[1][row])[far].max(initial=0) <= 1
+        if time_s < 0.5 or time_s >= 3.0:
+            assert not is_walker.any()
+    covered = [(a != b).mean() for a, b in zip(*depths, strict=True)]
+    during = [share for share, time_s in zip(covered, times_s, strict=True) if 1.5 < time_s < 3.0]
+    assert 0.1 < np.mean(during) < 0.6
+    assert np.ptp(during) > 0.02
+
+
+def test_a_walker_has_constant_velocity_on_each_crossing() -> None:
+    spline = data().recordings[0].recording.spline
+    options = sim.SessionImages(walkers=1, walkers_until_s=5.0)
+    walkers = Walkers.of(options, spline, 0.0, np.random.default_rng(1))
+    places = np.array([walkers.offset(time_s)[0] for time_s in np.arange(0.1, 2.4, 0.2)])
+    steps = np.diff(places, axis=0)
+    np.testing.assert_allclose(steps, np.tile(steps[0], (len(steps), 1)), atol=1e-12)
+    assert 0.3 <= np.linalg.norm(steps[0]) / 0.2 <= 1.0
+    assert (places[:, 2] == 0.0).all()
+    assert np.linalg.norm(walkers.offset(2.6)[0] - places[-1]) > 0.5
+    assert walkers.offset(5.1)[0, 2] < -100.0
 
 
 # -- surfaces -------------------------------------------------------------------------------------

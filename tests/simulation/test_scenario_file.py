@@ -97,6 +97,11 @@ def test_a_file_overrides_what_it_names(tmp_path: Path) -> None:
             "appearance.vanish_share: must be at least 0 and at most 1",
         ),
         ("measurement: {frame_rate_hz: 500}", "measurement.frame_rate_hz: must not exceed"),
+        ("sessions: [{images: {walkers: 1}}]", r"images.walkers: needs images.render: true"),
+        (
+            "sessions: [{images: {walkers_from_s: 3, walkers_until_s: 2}}]",
+            r"sessions\[0\].images.walkers_until_s: must be after",
+        ),
         ("name: [", "line 1: this is not YAML: expected the node content"),
         ("imu: {rate_hz: 1, rate_hz: 2}", "this is not YAML: key 'rate_hz' twice, line 1"),
         ("world:\n\trooms: 1", "line 2: this is not YAML: found character"),
