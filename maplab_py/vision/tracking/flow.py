@@ -41,7 +41,8 @@ class Pyramid:
         """Make the levels that patches fit into."""
         import cv2
 
-        border, level, levels = 2 * options.patch_size_px + _BORDER_PX, image, []
+        border, level = 2 * options.patch_size_px + _BORDER_PX, image
+        levels: list[U8] = []
         for _ in range(options.levels + 1):
             if levels:
                 level = np.asarray(cv2.pyrDown(level), dtype=np.uint8)
