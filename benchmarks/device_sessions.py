@@ -102,7 +102,7 @@ def run(given: argparse.Namespace) -> None:
     nominal, device = scenarios(given.seed, given.keypoints, given.seconds)
     sensors = data_set(nominal, 0).maps[0].sensors
     database, truth_blocks = folder / "device.segments", None
-    own = f"--self_calibrate --sc_database={database} --sc_apply=next_start"
+    flags = f"--self_calibrate --sc_database={database} --sc_apply=next_start"
     first_mm = 0.0
     for number in range(only - 1, only) if only else range(sessions):
         data = data_set(device, number)
@@ -114,7 +114,7 @@ def run(given: argparse.Namespace) -> None:
             save_map(data.maps[0].replace(sensors=sensors), source)
             save_map(data.maps[0].replace(sensors=right.sensors), best)
         size_mm, words = _error_mm(
-            truth, source, folder / f"device_{number}.csv", f"{own} --save_map_folder={out}"
+            truth, source, folder / f"device_{number}.csv", f"{flags} --save_map_folder={out}"
         )
         first_mm = first_mm or size_mm
         print(f"session {number + 1}: {size_mm:.1f} mm; {words}", flush=True)

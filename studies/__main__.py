@@ -6,11 +6,13 @@ python -m studies predict --scenario=ar_room --sets=3 --out=ar_room_predicted.js
 python -m studies consistency --sets=50 --swaps=0.03 --out=swaps.jsonl
 python -m studies page --results=ar_room.jsonl --consistency=swaps.jsonl --docs=results
 python -m studies picture --out=docs/images/segment_information.svg
+python -m studies figures --sets=3 --out=docs/images/self_calibration_figures.svg
+python -m studies borders --sets=4 --out=borders.jsonl
 
 The first four studies append one line per data set and method to a file; a study that was interrupted
 continues. All data sets are recorded with the same device in the same room; motion, noise and appearance
 differ. `page` writes self_calibration_results.md and images/ into a folder; `picture` draws a session,
-coloured by information.
+coloured by information, `figures` counterparts of those of the thesis.
 """
 
 import argparse
@@ -26,7 +28,14 @@ from maplab_py.output_files import write_text
 from maplab_py.simulation.scenario import Scenario
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate
-from studies import accuracy, odometry, predicted_deviations, results_page
+from studies import (
+    accuracy,
+    figures,
+    odometry,
+    predicted_deviations,
+    results_page,
+    segment_borders,
+)
 from studies.data_sets import OPTIONS, with_noise
 from studies.selections import JUDGED, METHODS
 
@@ -53,6 +62,12 @@ def main(words: Sequence[str] | None = None) -> int:
         odometry.measure_odometry(scenario, given.results, given.methods.split(","), given.out)
         return 0
     sets = range(given.first, given.first + given.sets)
+    if given.study == "figures":
+        figures.draw(scenario, sets, given.out)
+        return 0
+    if given.study == "borders":
+        segment_borders.compare(scenario, sets, given.out)
+        return 0
     if given.study == "predict":
         predicted_deviations.predict(scenario, sets, given.out)
         return 0
@@ -84,6 +99,8 @@ def _parser() -> argparse.ArgumentParser:
         ("measure", 15),
         ("consistency", 50),
         ("predict", 3),
+        ("figures", 3),
+        ("borders", 10),
         ("odometry", 0),
         ("picture", 0),
     ):

@@ -12,7 +12,7 @@ import pytest
 from maplab_py.algorithms.self_calibration.segments.selection import Evaluation, evaluate
 from maplab_py.simulation.scenario import MotionOptions, Scenario, SessionOptions
 from maplab_py.simulation.scenario_file import load_scenario
-from studies import accuracy, odometry, predicted_deviations
+from studies import accuracy, figures, odometry, predicted_deviations
 from studies.__main__ import main
 from studies.data_sets import lines_of
 from studies.selections import METHODS, chosen_segments, joint_designs, rankings
@@ -135,3 +135,12 @@ def test_errors_are_compared_with_deviations(tmp_path: Path) -> None:
     shutil.copy(out, tmp_path / "again.jsonl")
     assert main(words) == 0
     assert out.read_bytes() == (tmp_path / "again.jsonl").read_bytes()
+
+
+def test_the_figures_of_the_thesis_have_counterparts(tmp_path: Path) -> None:
+    scenario, out = short_scenario(), tmp_path / "figures.svg"
+    figures.draw(scenario, range(1), out, walk=scenario)
+    drawn = out.read_text()
+    for number in ("6.5", "6.8", "6.9", "7.8", "7.9", "7.10", "7.11"):
+        assert f"<!-- {number}: " in drawn  # matplotlib names its titles in comments
+    assert "nan" not in drawn

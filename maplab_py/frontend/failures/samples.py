@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import collections
+
 import numpy as np
 
 from maplab_py.array_types import F64, I64
@@ -14,6 +16,8 @@ _STUCK_FACTOR = 5
 _FEWEST_AT_LIMIT = 4
 """Equal samples after which an axis is stuck (so long, and so many times the longest run before), or at a
 limit."""
+_REMEMBERED = 20
+"""Calls, a second of frames, whose extremes an axis at a limit does not exceed: earlier ones may."""
 
 
 class SampleWatch:
@@ -25,7 +29,7 @@ class SampleWatch:
         self._run = np.zeros(6, dtype=np.int64)  # equal samples up to now
         self._run_ns = np.zeros(6, dtype=np.int64)  # time of the first of them
         self._longest = np.ones(6, dtype=np.int64)  # of runs that were no failure
-        self._extremes = np.array([np.full(6, np.inf), np.full(6, -np.inf)])
+        self._extremes: collections.deque[F64] = collections.deque(maxlen=_REMEMBERED)
         self.signs: dict[ImuPart, tuple[str, int]] = {}  # what is wrong now, and since when
         self.axes = np.zeros(6, dtype=np.bool_)  # that are wrong now
 
@@ -44,8 +48,7 @@ class SampleWatch:
         self._run = length[-1]
         self._run_ns = np.where(start[-1] >= 0, times_ns[start[-1]], self._run_ns)
         self._last = accel_gyro[-1]
-        self._extremes[0] = np.minimum(self._extremes[0], accel_gyro.min(axis=0))
-        self._extremes[1] = np.maximum(self._extremes[1], accel_gyro.max(axis=0))
+        self._extremes.append(np.array([accel_gyro.min(axis=0), accel_gyro.max(axis=0)]))
         self._judge(int(times_ns[-1]))
 
     def _judge(self, now_ns: int) -> None:
@@ -53,7 +56,10 @@ class SampleWatch:
         duration_ns = now_ns - self._run_ns
         is_live = bool(np.any(self._run <= self._longest))  # the whole IMU does not rest
         is_stuck = (duration_ns > _LEAST_STUCK_NS) & (self._run > _STUCK_FACTOR * self._longest)
-        is_extreme = (self._last == self._extremes[0]) | (self._last == self._extremes[1])
+        recent = np.array(self._extremes)
+        is_extreme = (self._last == recent[:, 0].min(axis=0)) | (
+            self._last == recent[:, 1].max(axis=0)
+        )
         at_limit = is_extreme & (self._run >= np.maximum(_FEWEST_AT_LIMIT, 2 * self._longest + 1))
         self.axes = (is_stuck | at_limit) & is_live
         self.signs = {}
