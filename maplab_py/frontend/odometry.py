@@ -40,8 +40,7 @@ from maplab_py.vision.tracking.tracker import FrameTracker
 from maplab_py.vision.tracking.tracks import TrackedImages
 from maplab_py.vision.tracking.views import focal_length_px
 
-_MAX_WAITING = 200
-"""Frames that may wait for IMU samples."""
+_MAX_WAITING = 200  # frames that may wait for IMU samples
 _DELAY_STEP_NS = 2_000_000
 """Largest change of the delay of images from one frame to the next while the window has states."""
 _NOISE_TIME_NS = 900_000_000

@@ -73,7 +73,7 @@ def _visual_source() -> str:
         f"POSE, LANDMARK, CAMERA, NUM_OUT = {_POSE}, {_LANDMARK}, {_CAMERA}, {_CAMERA}\n"
         f"DELAY, INTRINSICS = CAMERA + {delay}, CAMERA + {intrinsics}\n\n\n"
     )
-    names = ("camera", "visual_common", "visual", "visual_jacobians")
+    names = ("camera", "visual_common", "visual", "visual_step", "visual_jacobians")
     return "\n\n".join([_HEADER + places + _camera_source(), *map(template_source, names)])
 
 
