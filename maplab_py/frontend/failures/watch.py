@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -38,6 +39,7 @@ _LOST_SHARE, _LOST_NS = 0.2, 600_000_000
 """A camera that sees so small a share of the points of its leader, for so long, compared with before."""
 _MISFIT_RAD = 0.01
 """Points of a camera are so far from where those of all cameras are seen."""
+_GYROSCOPE = (ImuPart.GYROSCOPE,)
 _SHIFTED = "its points do not fit: shifted on its mounting?"
 
 
@@ -252,29 +254,32 @@ class SensorWatch:
             return None
         alone = {row: self._comparison.compared(frozenset([row])) for row in cameras}
         known = {row: each for row, each in alone.items() if each is not None}
-        wrong = [row for row, each in known.items() if self._is_unusual(each)]
+        # few points tell a rate better than an acceleration
+        wrong = [row for row, each in known.items() if self._excess(each, _GYROSCOPE) > 1.0]
+        wrong = wrong or [row for row, each in known.items() if self._is_unusual(each)]
         right = [row for row in known if row not in wrong]
-        if len(right) == 0 or len(wrong) != 1:
+        if len(wrong) != 1 or not (right or np.nanmax(joint.fit_rad) > _MISFIT_RAD):
             return None
-        bad, good = known[wrong[0]], known[right[0]]
-        apart = dataclasses.replace(
-            bad, rate=bad.rate - good.rate, acceleration=bad.acceleration - good.acceleration
-        )
-        if not self._is_unusual(apart):  # the cameras agree: it is the IMU, near the limit
-            return None
+        if right:
+            bad, good = known[wrong[0]], known[right[0]]
+            apart = dataclasses.replace(
+                bad, rate=bad.rate - good.rate, acceleration=bad.acceleration - good.acceleration
+            )
+            if not self._is_unusual(apart):  # the cameras agree: it is the IMU, near the limit
+                return None
         self._fail(f"camera {wrong[0]}", _SHIFTED, joint.since_ns, now_ns)
         return wrong[0]
 
     def _is_unusual(self, disagreement: Disagreement) -> bool:
         return self._excess(disagreement) > 1.0
 
-    def _excess(self, disagreement: Disagreement) -> float:
+    def _excess(self, disagreement: Disagreement, parts: Iterable[ImuPart] = tuple(PARTS)) -> float:
         """Return the larger excess of the parts of the IMU that are whole; 0 without a gyroscope."""
         if ImuPart.GYROSCOPE in self.failed:
             return 0.0
         counted = (
             self._usual[part].excess(part, _of(disagreement, part))
-            for part in PARTS
+            for part in parts
             if part not in self.failed and disagreement.since_ns >= self._usual[part].from_ns
         )
         return max(counted, default=0.0)
