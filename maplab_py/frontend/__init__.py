@@ -4,8 +4,6 @@ A driver makes an `Odometry`, pushes samples and images, and gives the updates t
 `Mapping` does both for a recording. docs/record_your_own_map.md has an example.
 """
 
-from __future__ import annotations
-
 import importlib
 from typing import TYPE_CHECKING, Any
 

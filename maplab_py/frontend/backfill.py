@@ -4,8 +4,6 @@ Reading backwards is the same estimation with time reversed: accelerations and a
 velocities, angular velocities and the gyroscope's bias change their sign.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 

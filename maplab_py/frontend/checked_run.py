@@ -1,7 +1,5 @@
 """A run over a recording that is checked before and after, and mended where its calibration does not fit."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable
 

@@ -1,23 +1,18 @@
 """Opening of the recording that a user names."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from maplab_py.errors import UserError
 from maplab_py.frontend.run_options import DataSourceOptions
-from maplab_py.interop.recordings.map_replay import MapRecording
+from maplab_py.interop.recordings import map_replay, protocol, reader_choice
 from maplab_py.interop.recordings.options import SourceOptions
-from maplab_py.interop.recordings.protocol import Recording
-from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.storage.native import is_map_folder, load_map
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.queries import find_mission
+from maplab_py.vimap import VIMap, queries
 
 
 def open_source(
     folder: Path | None, options: DataSourceOptions, source: SourceOptions
-) -> Recording:
+) -> protocol.Recording:
     """Open the recording that the options name.
 
     Args:
@@ -38,10 +33,10 @@ def open_source(
     if is_map:
         source.device.check_unused("a mission names its sensors")
         vi_map, _ = load_map(path)
-        return MapRecording(vi_map, _mission(vi_map, options.map_mission))
+        return map_replay.MapRecording(vi_map, _mission(vi_map, options.map_mission))
     if options.map_mission:
         raise UserError(f"--map_mission={options.map_mission}: {path} is not a map folder")
-    recording = open_recording(path, source)
+    recording = reader_choice.open_recording(path, source)
     is_bag = recording.kind.endswith("bag")
     if options.type in ("euroc", "rosbag") and is_bag != (options.type == "rosbag"):
         raise UserError(f"--datasource_type={options.type}: {path} is a {recording.kind}")
@@ -51,7 +46,7 @@ def open_source(
 def _mission(vi_map: VIMap, prefix: str) -> int:
     """Return the row of the mission to replay."""
     is_only = len(vi_map.missions) == 1 and not prefix
-    return 0 if is_only else find_mission(vi_map, prefix)
+    return 0 if is_only else queries.find_mission(vi_map, prefix)
 
 
 def _path(folder: Path | None, options: DataSourceOptions) -> Path:

@@ -4,23 +4,16 @@ After darkness or a covered lens the odometry starts a new mission. The last sta
 until the first state after it, say how the device has moved between them, and how surely.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Self
 
 import numpy as np
 
 from maplab_py.array_types import F64, I64
-from maplab_py.estimation.imu.inertial_data import InertialData
-from maplab_py.estimation.imu.preintegration import integrate
+from maplab_py.estimation.imu import inertial_data, preintegration
 from maplab_py.geometry import se3, so3, yaw
 from maplab_py.sensors import Imu
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.ids import random_ids
-from maplab_py.vimap.merge import stack
-from maplab_py.vimap.nav_state import NavState
-from maplab_py.vimap.tables import LoopClosureEdges
+from maplab_py.vimap import VIMap, ids, merge, nav_state, tables
 
 LONGEST_S = 20.0
 """Beyond this nothing useful is left of a velocity: 2 cm/s and 0.02 m/s^2 make 4 m."""
@@ -43,7 +36,7 @@ class Tie:
 
     @classmethod
     def by_samples(
-        cls, imu: Imu, last: NavState, covariance: F64 | None, times_ns: I64, samples: F64
+        cls, imu: Imu, last: nav_state.NavState, covariance: F64 | None, times_ns: I64, samples: F64
     ) -> Self:
         """Integrate the samples (S, 6) from a state to the time of the last sample.
 
@@ -54,10 +47,10 @@ class Tie:
             times_ns: Times (S,) of the samples.
             samples: As measured.
         """
-        data = InertialData(
+        data = inertial_data.InertialData(
             np.array([0, len(times_ns)]), times_ns, samples, (imu,), np.zeros(1, dtype=np.int64)
         )
-        edge = integrate(data, last.gyro_bias, last.accel_bias)
+        edge = preintegration.integrate(data, last.gyro_bias, last.accel_bias)
         t = float(edge.duration_s[0])
         R_I_M = so3.to_matrix(last.T_M_I[0, :4]).T
         gravity_M = np.array([0.0, 0.0, -imu.gravity_magnitude_mps2])
@@ -121,17 +114,17 @@ def tied(before: VIMap, following: VIMap, tie: Tie) -> VIMap:
     frames = following.baseframes.replace(
         T_G_M=tie.base_frame(before.T_G_I[a], first.T_M_I[0])[None]
     )
-    result = stack(before, following.replace(baseframes=frames))
+    result = merge.stack(before, following.replace(baseframes=frames))
     rng = np.random.default_rng(int(first.id[0, 0]))
-    edge = LoopClosureEdges.filled(
+    edge = tables.LoopClosureEdges.filled(
         1,
-        id=random_ids(1, rng),
+        id=ids.random_ids(1, rng),
         from_vertex=np.array([a]),
         to_vertex=np.array([b]),
         T_A_B=tie.T_A_B[None],
         covariance=tie.covariance[None],
     )
-    edges = LoopClosureEdges.concatenate([result.loop_closure_edges, edge])
+    edges = tables.LoopClosureEdges.concatenate([result.loop_closure_edges, edge])
     is_known = result.baseframes.is_known.copy()
     if tie.is_known:
         missions = result.vertices.mission[[a, b]]

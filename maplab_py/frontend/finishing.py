@@ -1,7 +1,5 @@
 """The end of a run: landmarks, localisation map, files, report."""
 
-from __future__ import annotations
-
 import dataclasses
 import tempfile
 import uuid
@@ -17,12 +15,10 @@ from maplab_py.algorithms.scale_check import scale_doubts
 from maplab_py.algorithms.sparsification.options import SparsificationOptions
 from maplab_py.algorithms.sparsification.sparsify import sparsify
 from maplab_py.algorithms.summary.workflow import WorkflowOptions, make_localization_map
-from maplab_py.algorithms.vi_optimization.calibration_choice import describe_freed
-from maplab_py.algorithms.vi_optimization.optimization import contradicted_calibration, optimize
+from maplab_py.algorithms.vi_optimization import calibration_choice, optimization
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.errors import Cancelled, EstimationError, MaplabError, UserError
-from maplab_py.frontend.localization.record import summarised
-from maplab_py.frontend.localization.reports import LocalizationSummary
+from maplab_py.frontend.localization import record, reports
 from maplab_py.frontend.mapping import Mapping
 from maplab_py.frontend.reports import MappingReport
 from maplab_py.frontend.run_options import OutputOptions
@@ -140,7 +136,7 @@ def _has_wrong_calibration(
     if mapping.odometry.watch.failures:
         return False
     try:
-        return mapping.is_mended or contradicted_calibration(vi_map, progress)
+        return mapping.is_mended or optimization.contradicted_calibration(vi_map, progress)
     except EstimationError:  # nothing in the map can be optimised
         return False
 
@@ -159,7 +155,7 @@ def _adjusted(
     free: dict[str, Any] = {name: False for name in names if name.startswith("fix_ncamera_")}
     options = VIOptimizationOptions(**free)
     try:
-        result, report = optimize(vi_map, options, progress=progress)
+        result, report = optimization.optimize(vi_map, options, progress=progress)
     except EstimationError as error:
         return vi_map, doubts, [f"not optimised with its calibration free: {error}"]
     left = scale_doubts(result)
@@ -167,7 +163,7 @@ def _adjusted(
         return vi_map, doubts, [f"not optimised with its calibration free: {left[0]}"]
     note = (
         "the map was optimised with the calibration of the cameras free, since the recording's was wrong: "
-        f"{', '.join(describe_freed(options, report))}; reprojection error "
+        f"{', '.join(calibration_choice.describe_freed(options, report))}; reprojection error "
         f"{report.median_reprojection_before_px:.2f} px before, {report.median_reprojection_after_px:.2f} px "
         "after (--vio_apply_calibration=false keeps it)"
     )
@@ -361,12 +357,12 @@ def _report(
     )
 
 
-def _localization(mapping: Mapping) -> LocalizationSummary | None:
+def _localization(mapping: Mapping) -> reports.LocalizationSummary | None:
     if mapping.localization is None:
         return None
     csv_file = mapping.options.output.export_localized_poses_to_csv
     zero_ns = mapping.statistics.zero_ns or mapping.statistics.first_ns
-    return summarised(mapping.localization, zero_ns, csv_file)
+    return record.summarised(mapping.localization, zero_ns, csv_file)
 
 
 def _good(vi_map: VIMap) -> int:

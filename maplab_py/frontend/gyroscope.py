@@ -1,7 +1,5 @@
 """The turn between two frames as the gyroscope measures it."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

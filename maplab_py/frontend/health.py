@@ -1,7 +1,5 @@
 """Recognising that an estimate has diverged."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.array_types import F64

@@ -1,13 +1,10 @@
 """The delay of the images on the clock of the IMU, as it shows while a recording is read."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.estimation.linear.threads import single_thread
 from maplab_py.estimation.window.frame import ImuPart, WindowFrame
-from maplab_py.frontend.initialization.gyro_bias import fit_turns, ray_pairs
-from maplab_py.frontend.initialization.rays import RayMaker
+from maplab_py.frontend.initialization import gyro_bias, rays
 from maplab_py.frontend.initialization.segment import History
 from maplab_py.interop.recordings.protocol import RecordedSensors
 
@@ -34,7 +31,7 @@ class DelayMonitor:
         """Begin without a measurement."""
         assert device.imu is not None
         self._imu = device.imu
-        self._rays = RayMaker(device.cameras, device.T_I_C)
+        self._rays = rays.RayMaker(device.cameras, device.T_I_C)
         self._history = History(_SPAN_S + 1e-3)
         self._mean_s, self._variance = 0.0, _PRIOR_SIGMA_S**2
         self.applied_s = 0.0
@@ -63,11 +60,11 @@ class DelayMonitor:
             return False
         with single_thread():
             segment = self._history.segment(self._imu, _INTERVAL_S)
-            pairs = ray_pairs(self._rays.of(segment))
+            pairs = gyro_bias.ray_pairs(self._rays.of(segment))
             self.reset()
             if len(pairs.first_frame) < _MIN_PAIRS:
                 return False
-            fit = fit_turns(segment.inertial, pairs)
+            fit = gyro_bias.fit_turns(segment.inertial, pairs)
         self._add(self.applied_s + fit.delay_s, max(fit.delay_sigma_s, _LEAST_SIGMA_S))
         change_s = self._mean_s - self.applied_s
         least_s = _CHANGE_S if self.applied_s else _FIRST_CHANGE_S

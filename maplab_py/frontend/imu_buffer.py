@@ -1,7 +1,5 @@
 """IMU samples that wait for images: cut and interpolated at the times of frames."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

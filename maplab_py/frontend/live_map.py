@@ -1,7 +1,5 @@
 """The map of a run while it goes on, for the viewer."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.array_types import F64, I64, U8
@@ -9,8 +7,7 @@ from maplab_py.frontend.localization.online import LocalizedFrame
 from maplab_py.frontend.map_builder import MapBuilder
 from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.geometry import se3
-from maplab_py.vimap import LandmarkQuality, VIMap
-from maplab_py.vimap.edits import add_landmarks
+from maplab_py.vimap import LandmarkQuality, VIMap, edits
 
 _LONG_TRACK = 20
 """Frames after which a track counts as long."""
@@ -97,7 +94,7 @@ def live_map(builder: MapBuilder, landmarks: LiveLandmarks, T_G_M: F64 | None = 
     root = int(vi_map.vertex_start[len(vi_map.missions) - 1])
     p_I = se3.transform(se3.inverse(vi_map.vertices.T_M_I[root]), p_M)
     none = np.zeros(0, dtype=np.int64)
-    return add_landmarks(
+    return edits.add_landmarks(
         vi_map,
         vertex=np.full(len(p_M), root),
         p_I=p_I,

@@ -1,7 +1,5 @@
 """Building a map from the states of odometry, tracked keypoints and IMU samples."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from concurrent.futures import Future
@@ -19,9 +17,7 @@ from maplab_py.frontend.run_options import MapBuilderOptions
 from maplab_py.interop.recordings.protocol import RecordedSensors
 from maplab_py.progress import SILENT, Progress
 from maplab_py.storage.resources.new import NewResources
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.merge import stack
-from maplab_py.vimap.nav_state import NavState
+from maplab_py.vimap import VIMap, merge, nav_state
 
 _EARLY = 0.95
 """A frame may come this share of the interval after the last vertex (maplab's tolerance)."""
@@ -141,7 +137,7 @@ class MapBuilder:
 
     def add_vertex(
         self,
-        state: NavState,
+        state: nav_state.NavState,
         frames: VertexFrames,
         images: Sequence[U8 | None] = (),
         covariance: F64 | None = None,
@@ -173,7 +169,7 @@ class MapBuilder:
             )
         ]
 
-    def refine(self, states: NavState) -> None:
+    def refine(self, states: nav_state.NavState) -> None:
         """Replace the states of vertices of the present mission that have one of these times."""
         self._missions[-1].refine(states)
 
@@ -212,7 +208,7 @@ class MapBuilder:
         result = mission_map(self._device, missions[0], self._images)
         for mission, tie in zip(missions[1:], self.ties()[1:], strict=True):
             part = mission_map(self._device, mission, self._images)
-            result = stack(result, part) if tie is None else tied(result, part, tie)
+            result = merge.stack(result, part) if tie is None else tied(result, part, tie)
         return result
 
     def make_part(self, mission: int, first: int) -> VIMap | None:

@@ -10,27 +10,14 @@ from typing import Protocol
 
 import numpy as np
 
-from maplab_py.algorithms.recording_check.findings import Finding
-from maplab_py.algorithms.recording_check.mending import MendedRecording
+from maplab_py.algorithms.recording_check import findings, mending
 from maplab_py.array_types import F64
 from maplab_py.errors import Cancelled, EstimationError, MaplabError, UserError
-from maplab_py.frontend.localization.online import LocalizedFrame, OnlineLocalization
-from maplab_py.frontend.localization.opening import opened_localization
-from maplab_py.frontend.localization.record import LocalizationRecord
-from maplab_py.frontend.map_builder import MapBuilder
+from maplab_py.frontend import map_builder, run_options, run_statistics, starting, vertex_keypoints
+from maplab_py.frontend.localization import online, opening, record
 from maplab_py.frontend.odometry import Odometry
 from maplab_py.frontend.odometry_update import OdometryUpdate
-from maplab_py.frontend.run_options import RunOptions
-from maplab_py.frontend.run_statistics import RunStatistics
-from maplab_py.frontend.starting import MakeStarter
-from maplab_py.frontend.vertex_keypoints import VertexKeypoints
-from maplab_py.interop.recordings.protocol import (
-    Event,
-    FrameSet,
-    ImuBatch,
-    Recording,
-)
-from maplab_py.interop.recordings.stream import EventStream
+from maplab_py.interop.recordings import protocol, stream
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.progress import SILENT, Progress
 
@@ -67,12 +54,12 @@ class Mapping:
 
     def __init__(
         self,
-        recording: Recording,
-        options: RunOptions | None = None,
+        recording: protocol.Recording,
+        options: run_options.RunOptions | None = None,
         *,
         staging_parent: Path | None = None,
         observer: Observer | None = None,
-        make_starter: MakeStarter | None = None,
+        make_starter: starting.MakeStarter | None = None,
         on_estimate: Callable[[OdometryUpdate, Mapping], None] | None = None,
         status: Callable[[], str] = str,
         keeps_states: bool = True,
@@ -92,17 +79,19 @@ class Mapping:
         Raises:
             UserError: The recording has no IMU, a file cannot be used, or a network is not installed.
         """
-        self.options = options or RunOptions()
+        self.options = options or run_options.RunOptions()
         self._recording, self._observer, self._status = recording, observer, status
         self._on_estimate = on_estimate
         device, localization = recording.device, self.options.localization
         features = localization.features or self.options.odometry.tracking.descriptor_type
-        self._keypoints = VertexKeypoints(features, self.options.builder.features_every)
-        self.localization = opened_localization(localization, device, self.options.odometry)
-        self.localized = LocalizationRecord()
-        self.localized_frame: LocalizedFrame | None = None
+        self._keypoints = vertex_keypoints.VertexKeypoints(
+            features, self.options.builder.features_every
+        )
+        self.localization = opening.opened_localization(localization, device, self.options.odometry)
+        self.localized = record.LocalizationRecord()
+        self.localized_frame: online.LocalizedFrame | None = None
         is_tight = self.localization is not None and localization.mode == "vil"
-        self.is_mended = isinstance(recording, MendedRecording)
+        self.is_mended = isinstance(recording, mending.MendedRecording)
         odometry = self.options.odometry
         self.odometry = Odometry(
             device,
@@ -110,16 +99,16 @@ class Mapping:
             make_starter=make_starter,
             map_rule=localization.rule if is_tight else None,
         )
-        self.builder: MapBuilder | None = None
+        self.builder: map_builder.MapBuilder | None = None
         if self.options.output.run_map_builder:
-            self.builder = MapBuilder(
+            self.builder = map_builder.MapBuilder(
                 recording.device, self.options.builder, staging_parent=staging_parent
             )
-        self.stream = EventStream(recording, self.options.stream)
-        self.statistics = RunStatistics()
+        self.stream = stream.EventStream(recording, self.options.stream)
+        self.statistics = run_statistics.RunStatistics()
         self.problem = ""
         self.is_ended_early = False
-        self.doubts: tuple[Finding, ...] | None = None
+        self.doubts: tuple[findings.Finding, ...] | None = None
         self._keeps_states = keeps_states
         self._states = array("d")  # time apart, rows of 16 numbers
         self._times_ns = array("q")
@@ -139,7 +128,7 @@ class Mapping:
             MaplabError: Nothing has been estimated, and the recording ended or cannot be read.
             Cancelled: The run was cancelled, or ended before anything was estimated.
         """
-        self.statistics = RunStatistics(
+        self.statistics = run_statistics.RunStatistics(
             zero_ns=self._recording.start_ns, notes=list(self._recording.device.notes)
         )
         try:
@@ -187,13 +176,13 @@ class Mapping:
         times_ns = np.array(self._times_ns, dtype=np.int64)
         return Trajectory(times_ns, T_M_I, v_M, gyro_bias, accel_bias, self._recording.name)
 
-    def _pushed(self, event: Event) -> list[OdometryUpdate]:
-        if isinstance(event, ImuBatch):
+    def _pushed(self, event: protocol.Event) -> list[OdometryUpdate]:
+        if isinstance(event, protocol.ImuBatch):
             read = self.stream.statistics
             if read.imu.count >= _ZERO_SAMPLES and read.zero_note:
                 raise UserError(f"{self._recording.name}: {read.zero_note}")
             return self.odometry.push_imu(event)
-        if isinstance(event, FrameSet):
+        if isinstance(event, protocol.FrameSet):
             return self.odometry.push_images(event)
         return self.odometry.push_tracks(event)
 
@@ -222,7 +211,7 @@ class Mapping:
             self._observer.after_frame(update, self)
 
     def _localize(
-        self, update: OdometryUpdate, localization: OnlineLocalization, progress: Progress
+        self, update: OdometryUpdate, localization: online.OnlineLocalization, progress: Progress
     ) -> None:
         """Find the frame in the map; what goes wrong there does not stop the odometry."""
         had_problem = localization.problem
@@ -252,7 +241,7 @@ class Mapping:
         known_s = (recording.end_ns - recording.start_ns) * 1e-9 if recording.end_ns else 0.0
         return min(filter(None, (chosen_s, known_s)), default=0.0)
 
-    def _build(self, update: OdometryUpdate, builder: MapBuilder) -> None:
+    def _build(self, update: OdometryUpdate, builder: map_builder.MapBuilder) -> None:
         if update.healthy_until_ns:
             builder.drop_after(update.healthy_until_ns)
         if update.has_diverged:
@@ -276,7 +265,7 @@ class Mapping:
         if update.backfill is not None:
             builder.fill(update.backfill)
 
-    def _keep_before_start(self, update: OdometryUpdate, builder: MapBuilder) -> None:
+    def _keep_before_start(self, update: OdometryUpdate, builder: map_builder.MapBuilder) -> None:
         """Keep a frame whose state may be found later."""
         if not self.options.odometry.backfill:
             return
@@ -301,10 +290,10 @@ class Mapping:
             f"error {update.window.median_error_px:.2f} px  {update.motion.value}"
         )
 
-    def _keep_pace(self, event: Event, is_to_end: Callable[[], bool]) -> None:
+    def _keep_pace(self, event: protocol.Event, is_to_end: Callable[[], bool]) -> None:
         """Wait until an event may be read at the chosen rate, or the run is to end."""
         rate = self.options.realtime_playback_rate
-        if not rate or isinstance(event, ImuBatch) or not self.statistics.frames:
+        if not rate or isinstance(event, protocol.ImuBatch) or not self.statistics.frames:
             return
         due_s = (event.time_ns - self.statistics.first_ns) * 1e-9 / rate
         due_s += self.statistics.began_s

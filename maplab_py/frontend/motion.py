@@ -1,14 +1,10 @@
 """Motion that does not show distances: standing still, and turning on the spot."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.array_types import F64, I64
 from maplab_py.estimation.window.frame import Motion
-from maplab_py.frontend.disparity import Keypoints, RecentKeypoints
-from maplab_py.frontend.imu_buffer import ImuInterval
-from maplab_py.frontend.odometry_options import RestOptions
+from maplab_py.frontend import disparity, imu_buffer, odometry_options
 from maplab_py.vision.tracking.tracks import TrackedImages
 
 _DISPARITY_TIME_S = 0.1
@@ -23,10 +19,10 @@ _NOISE_FACTOR = 1.25
 class MotionDetector:
     """Classifies the motion between frames."""
 
-    def __init__(self, options: RestOptions | None = None) -> None:
+    def __init__(self, options: odometry_options.RestOptions | None = None) -> None:
         """Start without samples."""
-        self._options = options or RestOptions()
-        self._keypoints = RecentKeypoints(self._options.imu_time_s)
+        self._options = options or odometry_options.RestOptions()
+        self._keypoints = disparity.RecentKeypoints(self._options.imu_time_s)
         self.reset()
 
     def reset(self) -> None:
@@ -50,7 +46,7 @@ class MotionDetector:
 
     def classify(
         self,
-        interval: ImuInterval,
+        interval: imu_buffer.ImuInterval,
         tracked: TrackedImages,
         *,
         turn_rad: float,
@@ -71,7 +67,7 @@ class MotionDetector:
                 they rest, is wrong, and must not keep the device from resting.
         """
         self._add(interval)
-        self._keypoints.push(Keypoints.of_images(tracked))
+        self._keypoints.push(disparity.Keypoints.of_images(tracked))
         options = self._options
         if (
             turn_rad < options.max_turn_rate * interval.duration_s
@@ -82,7 +78,7 @@ class MotionDetector:
             return Motion.RESTING
         return Motion.TURNING if tracked.is_turn_only else Motion.MOVING
 
-    def is_moving(self, interval: ImuInterval, turn_rad: float) -> bool:
+    def is_moving(self, interval: imu_buffer.ImuInterval, turn_rad: float) -> bool:
         """Tell whether the samples alone say that the device does not rest."""
         is_turning = turn_rad > self._options.max_turn_rate * interval.duration_s
         return is_turning or self.acceleration_deviation > self._options.max_acceleration_deviation
@@ -110,7 +106,7 @@ class MotionDetector:
         is_slow = half.px_per_s < limit and whole.px_per_s < _LONG_SHARE * limit
         return (is_below or is_noise) and is_slow
 
-    def _add(self, interval: ImuInterval) -> None:
+    def _add(self, interval: imu_buffer.ImuInterval) -> None:
         """Append samples, and forget those that are too old."""
         begin_ns = int(interval.times_ns[-1]) - round(self._options.imu_time_s * 1e9)
         # an interval repeats the last sample of the one before

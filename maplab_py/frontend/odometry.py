@@ -1,7 +1,5 @@
 """Visual-inertial odometry: IMU samples and images in, states out."""
 
-from __future__ import annotations
-
 import collections
 import dataclasses
 import time
@@ -16,18 +14,13 @@ from maplab_py.estimation.window.frame import ImuPart, Motion, WindowFrame
 from maplab_py.estimation.window.localized import LocalizedSmoother
 from maplab_py.estimation.window.options import MapRule
 from maplab_py.estimation.window.smoother import FixedLagSmoother
+from maplab_py.frontend import gyroscope, health, image_delay, odometry_options, starting
 from maplab_py.frontend.backfill import Backfill, Backfiller
 from maplab_py.frontend.failures.watch import SensorWatch
-from maplab_py.frontend.gyroscope import turn, turn_angle_rad
-from maplab_py.frontend.health import HealthMonitor
-from maplab_py.frontend.image_delay import DelayMonitor
 from maplab_py.frontend.imu_buffer import ImuBuffer, ImuInterval
-from maplab_py.frontend.initialization.imu_noise import plausible_noise
-from maplab_py.frontend.initialization.initializer import Initializer
+from maplab_py.frontend.initialization import imu_noise, initializer
 from maplab_py.frontend.motion import MotionDetector
-from maplab_py.frontend.odometry_options import OdometryOptions
 from maplab_py.frontend.odometry_update import OdometryCounts, OdometryStatus, OdometryUpdate
-from maplab_py.frontend.starting import MakeStarter, Start, Starter
 from maplab_py.interop.recordings.protocol import (
     FrameSet,
     ImuBatch,
@@ -35,10 +28,7 @@ from maplab_py.interop.recordings.protocol import (
     TrackedFrameSet,
 )
 from maplab_py.vimap.nav_state import NavState
-from maplab_py.vision.tracking.replay import tracked_images_of
-from maplab_py.vision.tracking.tracker import FrameTracker
-from maplab_py.vision.tracking.tracks import TrackedImages
-from maplab_py.vision.tracking.views import focal_length_px
+from maplab_py.vision.tracking import replay, tracker, tracks, views
 
 _MAX_WAITING = 200  # frames that may wait for IMU samples
 _DELAY_STEP_NS = 2_000_000
@@ -58,9 +48,9 @@ class Odometry:
     def __init__(
         self,
         device: RecordedSensors,
-        options: OdometryOptions | None = None,
+        options: odometry_options.OdometryOptions | None = None,
         *,
-        make_starter: MakeStarter | None = None,
+        make_starter: starting.MakeStarter | None = None,
         map_rule: MapRule | None = None,
     ) -> None:
         """Prepare for the sensors of a device.
@@ -81,24 +71,24 @@ class Odometry:
                 "odometry needs an IMU, and the calibration has none: give its file by "
                 "--imu_calibration_file=FILE, or a --sensor_calibration_file with an IMU"
             )
-        self.options = options or OdometryOptions()
+        self.options = options or odometry_options.OdometryOptions()
         self.counts = OdometryCounts()
         self._device, self._imu = device, device.imu
         self._make_starter = make_starter or self._initializer
         self._map_rule = map_rule
-        self._tracker = FrameTracker(device.cameras, device.T_I_C, self.options.tracking)
+        self._tracker = tracker.FrameTracker(device.cameras, device.T_I_C, self.options.tracking)
         self._buffer = ImuBuffer()
         self._waiting: collections.deque[FrameSet | TrackedFrameSet] = collections.deque()
         self._newest_ns = -1  # time of the newest frame that was pushed
         self._last_ns: int | None = None  # time of the last frame that was processed
         self._gap_end_ns = -1  # time of the last frame if its samples have a gap
-        self._replayed: TrackedImages | None = None  # tracks of the last frame of a replay
+        self._replayed: tracks.TrackedImages | None = None  # tracks of the last frame of a replay
         self._detector = MotionDetector(self.options.rest)
-        self._focal_px = min(focal_length_px(camera) for camera in device.cameras)
+        self._focal_px = min(views.focal_length_px(camera) for camera in device.cameras)
         self._smoother: FixedLagSmoother | None = None
-        self._delays: DelayMonitor | None = None
+        self._delays: image_delay.DelayMonitor | None = None
         if make_starter is None and self.options.estimates_time_offset:
-            self._delays = DelayMonitor(device)
+            self._delays = image_delay.DelayMonitor(device)
         self.watch = SensorWatch(device, device.imu)  # of sensors that fail
         self.notes: list[str] = []  # what is wrong with the calibration
         self._noise_is_open = make_starter is None and self.options.imu_noise == "auto"
@@ -108,13 +98,13 @@ class Odometry:
         )
         self.calibration_estimate: CalibrationEstimate | None = None
         self._backfiller = Backfiller(self._backward_smoother, is_wanted=self.options.backfill)
-        self._starter: Starter = self._make_starter(device)
+        self._starter: starting.Starter = self._make_starter(device)
         self._gyro_bias: F64 = np.zeros(3)
         self._newest_turn: tuple[ImuInterval, F64] | None = None
         self._start_again()
 
-    def _initializer(self, device: RecordedSensors) -> Starter:
-        return Initializer(device, self.options.initialization)
+    def _initializer(self, device: RecordedSensors) -> starting.Starter:
+        return initializer.Initializer(device, self.options.initialization)
 
     # -- what a driver pushes ---------------------------------------------------------------------
 
@@ -156,7 +146,7 @@ class Odometry:
         return self._device
 
     @property
-    def delays(self) -> DelayMonitor | None:
+    def delays(self) -> image_delay.DelayMonitor | None:
         """Delay of the images that shows in the recording; None where it is not looked for."""
         return self._delays
 
@@ -238,7 +228,7 @@ class Odometry:
         self._delay_ns += change_ns
         self._detector.reset()
         self._backfiller.waiting.delay(change_ns, self._buffer.samples)
-        if isinstance(self._starter, Initializer):
+        if isinstance(self._starter, initializer.Initializer):
             self._starter.replace_frames(self._backfiller.waiting.frames)
         if self._last_ns is not None:
             self._last_ns += change_ns
@@ -311,12 +301,12 @@ class Odometry:
         if not self._noise_is_open or frames[-1].time_ns - frames[0].time_ns < _NOISE_TIME_NS:
             return
         self._noise_is_open = False
-        self._imu, notes = plausible_noise(self._imu, *self._backfiller.waiting.samples())
+        self._imu, notes = imu_noise.plausible_noise(self._imu, *self._backfiller.waiting.samples())
         if notes:
             self.notes += notes
             self._device = self._device.with_imu(self._imu)
             self._starter = self._make_starter(self._device)
-            if isinstance(self._starter, Initializer):
+            if isinstance(self._starter, initializer.Initializer):
                 self._starter.replace_frames(frames[:-1])
 
     def _measure_delay(self, update: OdometryUpdate, frame: WindowFrame) -> bool:
@@ -338,12 +328,12 @@ class Odometry:
 
     def _tracked(
         self, frame_set: FrameSet | TrackedFrameSet, interval: ImuInterval | None, failed: ImuPart
-    ) -> tuple[TrackedImages, tuple[U8, ...]]:
+    ) -> tuple[tracks.TrackedImages, tuple[U8, ...]]:
         """Return the tracks of a frame set, and its images if it has some."""
         is_usable = interval is not None and ImuPart.GYROSCOPE not in failed
         R_I0_I1 = self._turn_in(interval) if interval and is_usable else None
         if isinstance(frame_set, TrackedFrameSet):
-            self._replayed = tracked_images_of(
+            self._replayed = replay.tracked_images_of(
                 frame_set, self._replayed, self._device.cameras, self._device.T_I_C, R_I0_I1,
                 self.options.tracking,
             )  # fmt: skip
@@ -365,12 +355,12 @@ class Odometry:
 
     def _turn_rad(self, interval: ImuInterval) -> float:
         """Return the angle of a turn, 0 while the gyroscope's bias is not known."""
-        return 0.0 if self._smoother is None else turn_angle_rad(self._turn_in(interval))
+        return 0.0 if self._smoother is None else gyroscope.turn_angle_rad(self._turn_in(interval))
 
     def _turn_in(self, interval: ImuInterval) -> F64:
         """Return the turn (3, 3) in an interval; the newest one is kept."""
         if self._newest_turn is None or self._newest_turn[0] is not interval:
-            self._newest_turn = interval, turn(self._imu, interval, self._gyro_bias)
+            self._newest_turn = interval, gyroscope.turn(self._imu, interval, self._gyro_bias)
         return self._newest_turn[1]
 
     def _visible_mps(self) -> float:
@@ -399,7 +389,7 @@ class Odometry:
             state=state,
         )  # fmt: skip
 
-    def _started(self, start: Start) -> NavState:
+    def _started(self, start: starting.Start) -> NavState:
         """Start the smoother, and add the frames that have come since; return the newest state."""
         smoother = self._new_smoother()
         smoother.start(start.frame, start.state)
@@ -410,7 +400,7 @@ class Odometry:
             newest = smoother.add(dataclasses.replace(frame, motion=Motion.MOVING)).state
             later.append(newest)
         self._smoother = smoother
-        self._health = HealthMonitor(self.options.health)
+        self._health = health.HealthMonitor(self.options.health)
         self._backfiller.start(start, newest, later)
         return newest
 
@@ -485,7 +475,7 @@ class Odometry:
     def _start_again(self, reason: str = "") -> str:
         """Forget all estimates and tracks but the calibration's; return the reason as a note."""
         self._smoother = None
-        self._health = HealthMonitor(self.options.health)
+        self._health = health.HealthMonitor(self.options.health)
         self._starter = self._make_starter(self._device)
         self._gyro_bias = np.zeros(3)
         self._speed_mps = 0.0

@@ -1,7 +1,5 @@
 """Result of the odometry after each frame."""
 
-from __future__ import annotations
-
 import dataclasses
 from enum import Enum
 

@@ -10,27 +10,13 @@ from concurrent.futures import Future
 import numpy as np
 
 from maplab_py.array_types import F64, I64, U8
-from maplab_py.frontend.backfill import cut_samples
-from maplab_py.frontend.dead_reckoning import LONGEST_S, Tie
+from maplab_py.frontend import backfill, dead_reckoning
 from maplab_py.interop.recordings.protocol import RecordedSensors, TrackedFrame
 from maplab_py.sensors import Imu
 from maplab_py.storage.resources.new import NewResources
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.descriptors import DescriptorBlock
+from maplab_py.vimap import VIMap, descriptors, nav_state, tables
 from maplab_py.vimap.ids import from_hex, random_ids
-from maplab_py.vimap.nav_state import NavState
 from maplab_py.vimap.table import object_column
-from maplab_py.vimap.tables import (
-    BaseFrames,
-    FrameField,
-    Frames,
-    ImuEdges,
-    ImuSamples,
-    Keypoints,
-    Missions,
-    MissionSensor,
-    Vertices,
-)
 
 Frame = TrackedFrame | None
 VertexFrames = tuple[Frame, ...] | Future[tuple[TrackedFrame, ...]]
@@ -39,7 +25,7 @@ _ALL = slice(None)
 _KEPT = 128
 """Vertices at the end whose covariances are kept: a few seconds without tracks are removed again."""
 
-_PRESENT = FrameField.SIGMA | FrameField.SCALE | FrameField.TRACK_ID
+_PRESENT = tables.FrameField.SIGMA | tables.FrameField.SCALE | tables.FrameField.TRACK_ID
 """Optional fields of keypoints that frames have; `LANDMARK_ID` follows with the landmarks."""
 
 
@@ -48,7 +34,7 @@ class RecordedMission:
 
     def __init__(self) -> None:
         """Start without vertices."""
-        self.states: list[NavState] = []
+        self.states: list[nav_state.NavState] = []
         self.frames: list[VertexFrames] = []
         self.image_rows: list[Sequence[int]] = []  # of new resources, -1 = none
         self.edges: list[tuple[I64, F64]] = []  # times and samples between vertices
@@ -76,10 +62,10 @@ class RecordedMission:
         if last_ns is None or self.is_doubtful:
             return
         self.add_imu(times_ns, accel_gyro)
-        if times_ns[-1] - last_ns > LONGEST_S * 1e9:
+        if times_ns[-1] - last_ns > dead_reckoning.LONGEST_S * 1e9:
             self.is_doubtful, self._samples = True, []
 
-    def tie_to(self, following: RecordedMission, imu: Imu) -> Tie | None:
+    def tie_to(self, following: RecordedMission, imu: Imu) -> dead_reckoning.Tie | None:
         """Return where the first vertex of the following mission is; None = nobody knows."""
         if not self.states or not following.states or self.is_doubtful:
             return None
@@ -88,13 +74,13 @@ class RecordedMission:
         last_ns = int(last.time_ns[0])
         if not len(times_ns) or not times_ns[0] <= last_ns < first_ns <= times_ns[-1]:
             return None
-        times_ns, samples = cut_samples(times_ns, samples, last_ns, first_ns)
+        times_ns, samples = backfill.cut_samples(times_ns, samples, last_ns, first_ns)
         covariance = next((c for at_ns, c in self._covariances if at_ns == last_ns), None)
-        return Tie.by_samples(imu, last, covariance, times_ns, samples)
+        return dead_reckoning.Tie.by_samples(imu, last, covariance, times_ns, samples)
 
     def add_vertex(
         self,
-        state: NavState,
+        state: nav_state.NavState,
         frames: VertexFrames,
         image_rows: Sequence[int],
         covariance: F64 | None = None,
@@ -171,7 +157,7 @@ class RecordedMission:
         """Return the vertex of a time, None if there is none."""
         return self._row_of_time.get(time_ns)
 
-    def refine(self, states: NavState) -> None:
+    def refine(self, states: nav_state.NavState) -> None:
         """Replace the states of vertices that have one of these times."""
         for index, time_ns in enumerate(states.time_ns.tolist()):
             row = self._row_of_time.get(time_ns)
@@ -203,24 +189,24 @@ def mission_map(
 
     Ids follow from the sensors and the time of the first vertex: equal input gives equal maps.
     """
-    states = NavState.stack(mission.states)
+    states = nav_state.NavState.stack(mission.states)
     seed = np.random.default_rng(_id_seed(device, int(states.time_ns[0])))
     # one for each table, so that an id stays while the mission grows
     rng, edge_rng, frame_rng, vertex_rng, set_rng = seed.spawn(5)
     count = len(states)
-    sensor_id = np.zeros((1, len(MissionSensor), 2), dtype=np.uint64)
-    sensor_id[0, MissionSensor.IMU] = from_hex(device.imu_id)
-    sensor_id[0, MissionSensor.NCAMERA] = from_hex(device.rig_id)
+    sensor_id = np.zeros((1, len(tables.MissionSensor), 2), dtype=np.uint64)
+    sensor_id[0, tables.MissionSensor.IMU] = from_hex(device.imu_id)
+    sensor_id[0, tables.MissionSensor.NCAMERA] = from_hex(device.rig_id)
     edges, samples = _imu_tables(mission, edge_rng)
     described = mission.described()
     frames = _frame_table(mission, described, frame_rng)
     vi_map = VIMap(
         sensors=device.sensors,
-        missions=Missions.filled(
+        missions=tables.Missions.filled(
             1, id=random_ids(1, rng), baseframe=[0], root_vertex=[0], sensor_id=sensor_id
         ),
-        baseframes=BaseFrames.filled(1, id=random_ids(1, rng)),
-        vertices=Vertices.filled(
+        baseframes=tables.BaseFrames.filled(1, id=random_ids(1, rng)),
+        vertices=tables.Vertices.filled(
             count,
             id=random_ids(count, vertex_rng),
             mission=np.zeros(count, dtype=np.int32),
@@ -247,9 +233,11 @@ def _id_seed(device: RecordedSensors, start_ns: int) -> int:
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=16).digest(), "little")
 
 
-def _imu_tables(mission: RecordedMission, rng: np.random.Generator) -> tuple[ImuEdges, ImuSamples]:
+def _imu_tables(
+    mission: RecordedMission, rng: np.random.Generator
+) -> tuple[tables.ImuEdges, tables.ImuSamples]:
     count = len(mission.edges)
-    table = ImuEdges.filled(
+    table = tables.ImuEdges.filled(
         count,
         id=random_ids(count, rng),
         from_vertex=np.arange(count),
@@ -258,12 +246,12 @@ def _imu_tables(mission: RecordedMission, rng: np.random.Generator) -> tuple[Imu
     )
     times = np.concatenate([times for times, _ in mission.edges])
     samples = np.concatenate([accel_gyro for _, accel_gyro in mission.edges])
-    return table, ImuSamples.filled(len(times), timestamp_ns=times, accel_gyro=samples)
+    return table, tables.ImuSamples.filled(len(times), timestamp_ns=times, accel_gyro=samples)
 
 
 def _frame_table(
     mission: RecordedMission, described: list[tuple[Frame, ...]], rng: np.random.Generator
-) -> Frames:
+) -> tables.Frames:
     """Return a row for each camera of each vertex; frames that are missing have no id."""
     cameras = len(described[0])
     frames = [frame for of_vertex in described for frame in of_vertex]
@@ -272,7 +260,7 @@ def _frame_table(
     ids = random_ids(count, rng)
     ids[~is_there] = 0
     times_ns = np.repeat([int(state.time_ns[0]) for state in mission.states], cameras)
-    return Frames.filled(
+    return tables.Frames.filled(
         count,
         id=ids,
         vertex=np.repeat(np.arange(len(mission)), cameras),
@@ -285,7 +273,7 @@ def _frame_table(
     )
 
 
-def _blocks(frame: Frame) -> tuple[DescriptorBlock, ...] | None:
+def _blocks(frame: Frame) -> tuple[descriptors.DescriptorBlock, ...] | None:
     """Return the runs of keypoints with descriptors of equal size, None without keypoints."""
     if frame is None or not len(frame.descriptor_size):
         return None
@@ -293,12 +281,12 @@ def _blocks(frame: Frame) -> tuple[DescriptorBlock, ...] | None:
     first = np.concatenate([[0], np.flatnonzero(np.diff(size)) + 1])
     counts = np.diff(np.append(first, len(size)))
     return tuple(
-        DescriptorBlock(count, width, frame.depth, frame.feature_type)
+        descriptors.DescriptorBlock(count, width, frame.depth, frame.feature_type)
         for count, width in zip(counts.tolist(), size[first].tolist(), strict=True)
     )
 
 
-def _keypoint_table(described: list[tuple[Frame, ...]]) -> Keypoints:
+def _keypoint_table(described: list[tuple[Frame, ...]]) -> tables.Keypoints:
     frames = [frame for of_vertex in described for frame in of_vertex if frame is not None]
     width = max((frame.descriptor.shape[1] for frame in frames), default=0)
     count = sum(len(frame.uv_px) for frame in frames)
@@ -313,4 +301,4 @@ def _keypoint_table(described: list[tuple[Frame, ...]]) -> Keypoints:
         for name in ("sigma_px", "scale", "track_id")
     }
     uv_px = np.concatenate([frame.uv_px for frame in frames] or [np.zeros((0, 2))])
-    return Keypoints.filled(count, uv_px=uv_px, descriptor=descriptor, **columns)
+    return tables.Keypoints.filled(count, uv_px=uv_px, descriptor=descriptor, **columns)

@@ -1,7 +1,5 @@
 """Report of a run over a recording."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Options of a run over a recording, with rovioli's flag names."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from maplab_py.errors import FlagError

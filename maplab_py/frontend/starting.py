@@ -1,7 +1,5 @@
 """Search for the state with which odometry starts."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from typing import Protocol

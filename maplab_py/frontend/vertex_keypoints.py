@@ -1,19 +1,14 @@
 """Keypoints of a vertex: tracks with descriptors."""
 
-from __future__ import annotations
-
 import collections
 from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 
 from maplab_py.array_types import U8, Mask
-from maplab_py.frontend.odometry_update import OdometryUpdate
-from maplab_py.frontend.recorded_mission import VertexFrames
+from maplab_py.frontend import odometry_update, recorded_mission
 from maplab_py.interop.recordings.protocol import TrackedFrame
-from maplab_py.vision.features.description import describe
-from maplab_py.vision.features.extractors import KINDS
-from maplab_py.vision.features.options import NETWORKS
+from maplab_py.vision.features import description, extractors, options
 from maplab_py.vision.tracking.tracks import CameraTracks, TrackedImages
 
 _BETWEEN = "brisk"
@@ -40,13 +35,13 @@ class VertexKeypoints:
         self._thread: ThreadPoolExecutor | None = None
         self._waiting: collections.deque[Future[tuple[TrackedFrame, ...]]] = collections.deque()
 
-    def of(self, update: OdometryUpdate) -> VertexFrames:
+    def of(self, update: odometry_update.OdometryUpdate) -> recorded_mission.VertexFrames:
         """Return the keypoints of a frame that becomes a vertex; those of a replay as they are."""
         if update.tracks is not None:
             return update.tracks.frames
         given = update.tracked, update.images, update.time_ns
         is_turn, self._count = self._count % self._every == 0, self._count + 1
-        if self._features not in NETWORKS:
+        if self._features not in options.NETWORKS:
             return described_frames(*given, self._features)
         if not is_turn:
             return described_frames(*given, _BETWEEN)
@@ -95,14 +90,14 @@ def check_descriptors_exist(descriptor_type: str) -> None:
 def _described(
     camera: int, tracks: CameraTracks, image: U8, stamp_ns: int, descriptor_type: str
 ) -> TrackedFrame:
-    kind = KINDS[descriptor_type]
+    kind = extractors.KINDS[descriptor_type]
     if descriptor_type == "xfeat":
         from maplab_py.vision.features.learned.xfeat import installed_xfeat
 
         descriptors: U8 = installed_xfeat().describe(image, tracks.uv_px).view(np.uint8)
         is_described: Mask = np.ones(len(tracks), dtype=np.bool_)
     else:
-        descriptors, is_described = describe(image, tracks.uv_px, tracks.scale)
+        descriptors, is_described = description.describe(image, tracks.uv_px, tracks.scale)
     kept = tracks.take(is_described)
     return TrackedFrame(
         camera=camera,

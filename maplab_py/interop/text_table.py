@@ -1,7 +1,5 @@
 """Fast reading and writing of text tables of numbers whose first column is a time stamp."""
 
-from __future__ import annotations
-
 import dataclasses
 import datetime as dt
 import re

@@ -4,8 +4,6 @@ TUM: `t[s] x y z qx qy qz qw`. EuRoC: `t[ns], p, q (w first), v, gyro bias, acce
 three rows of a homogeneous matrix, row by row, with the time stamps in a file of their own.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from pathlib import Path

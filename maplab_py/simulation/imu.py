@@ -1,7 +1,5 @@
 """IMU measurements along a motion (Schneider 2019, section 7) with random-walk biases."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -3,8 +3,6 @@
 Source: Sommer 2020, eq. (9) and (16)-(21), for order 4.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """People who walk through a rendered session: textured boxes in front of the cameras."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Self

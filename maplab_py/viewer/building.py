@@ -11,9 +11,8 @@ from maplab_py.algorithms.map_update.options import Change
 from maplab_py.array_types import F64
 from maplab_py.errors import UserError
 from maplab_py.interop.trajectories import Trajectory
-from maplab_py.viewer import colours
+from maplab_py.viewer import colours, extension
 from maplab_py.viewer.drawing import Drawing, ImageOf, make_drawing, no_image, spread_rows
-from maplab_py.viewer.extension import plugin_layers
 from maplab_py.viewer.history import State
 from maplab_py.viewer.layers import (
     cameras,
@@ -27,12 +26,9 @@ from maplab_py.viewer.layers import (
     references,
 )
 from maplab_py.viewer.layers.clouds import Cloud
-from maplab_py.viewer.layers.paths import LocalizedRun
-from maplab_py.viewer.layers.references import MarkedSegments
 from maplab_py.viewer.options import VisualizationOptions
 from maplab_py.viewer.scene import WHOLE_MAP, Axes, Extent, Layer, MissionEntry, Scene
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.queries import mission_distances_m, mission_time_spans_ns
+from maplab_py.vimap import VIMap, queries
 
 _MAX_RAYS = 60_000
 _OUTLINE_POINTS = 1500
@@ -55,8 +51,8 @@ class Subject:
     arrangement: Arrangement = "over"  # of the other map
     truth: Trajectory | None = None
     clouds: tuple[Cloud, ...] = ()
-    segments: MarkedSegments | None = None
-    localized: LocalizedRun | None = None
+    segments: references.MarkedSegments | None = None
+    localized: paths.LocalizedRun | None = None
     changes: tuple[Change, ...] = ()  # of a later session
     shows_observers: bool = False
     shows_sensors: bool = False  # the mounting of the sensors, and nothing of the map
@@ -155,7 +151,7 @@ def scene_of(drawing: Drawing, subject: Subject) -> Scene:
 
         more, unknown = coverage_layers(drawing)
         layers, unreadable = layers + more, unreadable + unknown
-    added, problems = plugin_layers(drawing, {layer.name for layer in layers})
+    added, problems = extension.plugin_layers(drawing, {layer.name for layer in layers})
     layers += added
     layers = [_with_visibility(layer, subject) for layer in layers if layer.total]
     extent = drawing.extent
@@ -199,8 +195,8 @@ def _widen(extent: Extent, p: F64) -> Extent:
 def mission_entries(drawing: Drawing) -> tuple[MissionEntry, ...]:
     """Return the missions as the panel lists them."""
     vi_map = drawing.vi_map
-    span_s = 1e-9 * np.diff(mission_time_spans_ns(vi_map), axis=1)[:, 0]
-    length_m = mission_distances_m(vi_map)
+    span_s = 1e-9 * np.diff(queries.mission_time_spans_ns(vi_map), axis=1)[:, 0]
+    length_m = queries.mission_distances_m(vi_map)
     codes = colours.hex_codes(drawing.mission_colours)
     known = vi_map.baseframes.is_known[vi_map.missions.baseframe]
     counts = np.diff(vi_map.vertex_start)

@@ -1,7 +1,5 @@
 """Colours for dark and light backgrounds: (..., 3) of uint8."""
 
-from __future__ import annotations
-
 import colorsys
 from collections.abc import Sequence
 

@@ -1,15 +1,11 @@
 """Facts about a vertex, a landmark or a loop closure for the panel."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.algorithms.landmarks.sightings import residuals
-from maplab_py.algorithms.loop_closure.closure_record import read_record
+from maplab_py.algorithms.loop_closure import closure_record, listing, options
 from maplab_py.algorithms.loop_closure.explanation import explain_closure
-from maplab_py.algorithms.loop_closure.listing import describe_closure
-from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
@@ -120,7 +116,7 @@ def loop_closure_facts(vi_map: VIMap, row: int) -> Facts:
 def _recorded_gates(vi_map: VIMap, edge: IdArray) -> Facts:
     """Return the gates of the recorded closure that an edge (id) was made from; none without one."""
     try:
-        closures = read_record(vi_map).closures
+        closures = closure_record.read_record(vi_map).closures
     except MapError:
         return ()
     rows = np.flatnonzero((closures.id == edge).all(axis=1))
@@ -129,7 +125,7 @@ def _recorded_gates(vi_map: VIMap, edge: IdArray) -> Facts:
 
 def closure_facts(vi_map: VIMap, row: int) -> Facts:
     """Return the recorded facts of a closure, as lc_report lists them, and its gates, as why does."""
-    line = describe_closure(vi_map, row)
+    line = listing.describe_closure(vi_map, row)
     why, *gates = gate_facts(vi_map, row)
     return (
         ("closure", line.id),
@@ -152,7 +148,7 @@ def closure_facts(vi_map: VIMap, row: int) -> Facts:
 
 def gate_facts(vi_map: VIMap, row: int) -> Facts:
     """Return why a recorded closure was accepted or refused: every gate, the failed ones first."""
-    explanation = explain_closure(vi_map, row, LoopClosureOptions())
+    explanation = explain_closure(vi_map, row, options.LoopClosureOptions())
     gates = sorted(explanation.gates, key=lambda gate: gate.result)
     lines = [
         (f"{gate.result}: {gate.gate}", f"{gate.value}, wanted {gate.wanted} {gate.flag}".rstrip())

@@ -1,15 +1,11 @@
 """The ground below a map: its grid, labelled axes and a scale bar."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
 
 from maplab_py.array_types import F64
-from maplab_py.viewer import colours
-from maplab_py.viewer.drawing import make_segments
-from maplab_py.viewer.scene import Extent, Segments
+from maplab_py.viewer import colours, drawing, scene
 
 _SECTION_CELLS = 5
 _STEP_CELLS = (1, 2, 5, 10, 20, 50)
@@ -29,13 +25,13 @@ class Ground:
     section_m: float
     position: F64  # (3,) of a crossing of thick grid lines
     reach_m: float  # distance at which the grid has faded
-    axes: Segments  # x, y and z along the edges of the map
-    bar: Segments  # the scale bar
+    axes: scene.Segments  # x, y and z along the edges of the map
+    bar: scene.Segments  # the scale bar
     labels: tuple[str, ...]
     p_labels: F64  # (N, 3)
 
 
-def make_ground(extent: Extent, origin_G: F64) -> Ground:
+def make_ground(extent: scene.Extent, origin_G: F64) -> Ground:
     """Return the ground of a map; grid lines are at round coordinates of G.
 
     Args:
@@ -51,7 +47,7 @@ def make_ground(extent: Extent, origin_G: F64) -> Ground:
     labels, p_labels = _axis_labels(low, high, origin_G, step)
     aside = np.array([0.0, -2.0 * cell, 0.0])
     start, end = low + aside, low + aside + np.array([step, 0.0, 0.0])
-    bar = make_segments(start[None], end[None], _BAR_COLOUR, np.array([0]), 5.0)
+    bar = drawing.make_segments(start[None], end[None], _BAR_COLOUR, np.array([0]), 5.0)
     labels.append(f"{step:g} m")
     p_labels.append(0.5 * (start + end))
     return Ground(
@@ -66,7 +62,7 @@ def cell_size_m(radius_m: float) -> float:
     return decade / 5.0 if radius_m < 2.5 * decade else decade / 2.0
 
 
-def _corners(extent: Extent, origin_G: F64, cell: float) -> tuple[F64, F64]:
+def _corners(extent: scene.Extent, origin_G: F64, cell: float) -> tuple[F64, F64]:
     """Return the lower and the upper corner of the map, on grid lines in x and y."""
     points = np.concatenate([extent.outline, extent.centre[None]])
     low, high = points.min(axis=0), points.max(axis=0)
@@ -104,8 +100,8 @@ def _axis_labels(low: F64, high: F64, origin_G: F64, step: float) -> tuple[list[
     return labels, places
 
 
-def _axes(low: F64, high: F64) -> Segments:
+def _axes(low: F64, high: F64) -> scene.Segments:
     """Return lines along x, y and z from the lower corner to the end of the map."""
     start = np.repeat(low[None], 3, axis=0)
     end = start + np.diag(high - low)
-    return make_segments(start, end, colours.AXES, np.arange(3), 2.0)
+    return drawing.make_segments(start, end, colours.AXES, np.arange(3), 2.0)

@@ -1,7 +1,5 @@
 """States of a map along its undo history: their errors as curves, and what an exported page draws of each."""
 
-from __future__ import annotations
-
 import dataclasses
 import weakref
 from collections.abc import Sequence
@@ -10,18 +8,15 @@ from html import escape
 import numpy as np
 
 from maplab_py.algorithms.landmarks.sightings import residuals
-from maplab_py.algorithms.loop_closure.closure_record import ClosureRecord, read_record
-from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
-from maplab_py.algorithms.loop_closure.reports import Verdict
+from maplab_py.algorithms.loop_closure import closure_record, closure_table, reports
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
 from maplab_py.interop.trajectories import Trajectory
-from maplab_py.viewer.colours import MISSIONS, hex_codes
+from maplab_py.viewer import colours, scene
 from maplab_py.viewer.drawing import Drawing
 from maplab_py.viewer.layers.landmarks import landmarks
 from maplab_py.viewer.layers.paths import trajectories
 from maplab_py.viewer.layers.references import position_errors
-from maplab_py.viewer.scene import Layer
 from maplab_py.vimap import VIMap
 
 MAX_STATES = 40
@@ -85,19 +80,21 @@ def _reprojection_px(vi_map: VIMap) -> float:
     return _REPROJECTION_PX[vi_map]
 
 
-def _accepted_closures(states: Sequence[State]) -> ClosureRecord:
+def _accepted_closures(states: Sequence[State]) -> closure_record.ClosureRecord:
     for state in reversed(states):
         try:
-            closures = read_record(state.vi_map).closures
+            closures = closure_record.read_record(state.vi_map).closures
         except MapError:
             continue
-        accepted = closures.take(closures.verdict == VERDICTS.index(Verdict.ACCEPTED))
+        accepted = closures.take(
+            closures.verdict == closure_table.VERDICTS.index(reports.Verdict.ACCEPTED)
+        )
         if len(accepted):
             return accepted
-    return ClosureRecord.empty()
+    return closure_record.ClosureRecord.empty()
 
 
-def _gap_m(vi_map: VIMap, closures: ClosureRecord) -> float:
+def _gap_m(vi_map: VIMap, closures: closure_record.ClosureRecord) -> float:
     """Return the median distance of the poses of a map from closures that it need not remember."""
     a, b = (vi_map.vertex_index.rows(ids) for ids in (closures.query, closures.place))
     kept = (a >= 0) & (b >= 0)
@@ -118,7 +115,7 @@ def _median(values: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> float:
     return float(np.median(finite)) if len(finite) else np.nan
 
 
-def state_layers(drawing: Drawing, state: State, states: int) -> tuple[Layer, ...]:
+def state_layers(drawing: Drawing, state: State, states: int) -> tuple[scene.Layer, ...]:
     """Return paths and landmarks of one of several states, where the drawing has its origin."""
     limit = min(drawing.options.max_points, max(1, _MAX_POINTS // states))
     options = dataclasses.replace(drawing.options, max_points=limit)
@@ -136,7 +133,7 @@ def state_facts(curves: Sequence[Curve], shown: int) -> list[str]:
 
 
 _WIDTH, _HEIGHT = 240.0, 26.0
-_COLOURS = hex_codes(MISSIONS)
+_COLOURS = colours.hex_codes(colours.MISSIONS)
 
 
 def history_chart(states: Sequence[State], curves: Sequence[Curve], shown: int) -> str:

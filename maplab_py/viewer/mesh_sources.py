@@ -1,23 +1,18 @@
 """Meshes to show: of the grids of a map, or of a file, and their colours."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 
 import numpy as np
 
+from maplab_py.algorithms.dense import meshing, triangle_tree
 from maplab_py.algorithms.dense.field import known_voxels, load_fields
-from maplab_py.algorithms.dense.meshing import map_mesh, vertex_colours
-from maplab_py.algorithms.dense.triangle_tree import TriangleTree
 from maplab_py.array_types import F64, I64, U8
 from maplab_py.errors import UserError
 from maplab_py.interop import mesh_files
 from maplab_py.progress import SILENT, Progress
-from maplab_py.viewer import colours
+from maplab_py.viewer import colours, options, scene
 from maplab_py.viewer.layers.clouds import Cloud
-from maplab_py.viewer.options import MeshColouring
-from maplab_py.viewer.scene import LegendEntry
 from maplab_py.vimap import VIMap
 
 _USUAL_PART = 95.0
@@ -40,14 +35,16 @@ def grid_mesh(
         MapError: A file is missing or damaged.
         EstimationError: The grids have no surface of this weight.
     """
-    mesh, _ = map_mesh(vi_map, map_folder, missions, min_weight)
+    mesh, _ = meshing.map_mesh(vi_map, map_folder, missions, min_weight)
     colours = None
     if with_colours:
-        colours = vertex_colours(vi_map, map_folder, mesh.p, missions, progress=progress)
+        colours = meshing.vertex_colours(vi_map, map_folder, mesh.p, missions, progress=progress)
     return Cloud("Mesh", mesh.p, colours, faces=mesh.faces)
 
 
-def coloured_mesh(mesh: Cloud, colouring: MeshColouring, reference: Cloud | None = None) -> Cloud:
+def coloured_mesh(
+    mesh: Cloud, colouring: options.MeshColouring, reference: Cloud | None = None
+) -> Cloud:
     """Return a mesh in the colours that a rule gives it.
 
     Args:
@@ -62,7 +59,7 @@ def coloured_mesh(mesh: Cloud, colouring: MeshColouring, reference: Cloud | None
     if colouring == "distance" or (colouring == "auto" and reference is not None):
         if reference is None or reference.faces is None:
             raise UserError("--mesh_colouring=distance needs another mesh: --mesh_reference_file")
-        distance = TriangleTree(reference.p_G, reference.faces).distances(mesh.p_G)
+        distance = triangle_tree.TriangleTree(reference.p_G, reference.faces).distances(mesh.p_G)
         largest = max(float(np.percentile(distance, _USUAL_PART)), 1e-9)
         low, high = "0 m", f"{largest:.3g} m"
         return _ramp(mesh, distance / largest, colours.HEAT, "distance", low, high)
@@ -76,7 +73,7 @@ def coloured_mesh(mesh: Cloud, colouring: MeshColouring, reference: Cloud | None
 
 
 def _ramp(mesh: Cloud, part: F64, stops: U8, text: str, low: str, high: str) -> Cloud:
-    legend = LegendEntry(text, tuple(colours.hex_codes(stops)), low, high)
+    legend = scene.LegendEntry(text, tuple(colours.hex_codes(stops)), low, high)
     return dataclasses.replace(mesh, colours=colours.ramp(part, stops), legend=(legend,))
 
 
@@ -123,7 +120,7 @@ def field_slice(
     near, far = float(distance_m[rows].min()), float(distance_m[rows].max())
     part = (distance_m[rows] - near) / max(far - near, 1e-9)
     stops = colours.SEQUENTIAL[::-1]
-    legend = LegendEntry(
+    legend = scene.LegendEntry(
         "distance", tuple(colours.hex_codes(stops)), f"{near:.3g} m", f"{far:.3g} m"
     )
     return Cloud("Distance field", p_G[rows], colours.ramp(part, stops), legend=(legend,))

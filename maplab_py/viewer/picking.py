@@ -1,7 +1,5 @@
 """Picking: the vertex, landmark or loop closure of a click."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

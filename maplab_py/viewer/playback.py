@@ -1,7 +1,5 @@
 """A map in the order in which it was recorded: what is there after each step."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -10,19 +10,16 @@ from numpy.typing import NDArray
 
 from maplab_py.array_types import F64, I64, U8, Mask
 from maplab_py.errors import MapError, UserError
-from maplab_py.geometry import se3
-from maplab_py.geometry.interpolation import interpolate_poses
+from maplab_py.geometry import interpolation, se3
 from maplab_py.interop.ply import parse_ply
 from maplab_py.progress import SILENT, Progress
-from maplab_py.sensors import Distortion
-from maplab_py.sensors.projection import back_project
+from maplab_py.sensors import Distortion, projection
 from maplab_py.storage.resources.store import ResourceStore
 from maplab_py.storage.resources.types import RESOURCE_TYPES
-from maplab_py.viewer import colours
+from maplab_py.viewer import colours, scene
 from maplab_py.viewer.layers.cameras import mission_cameras
 from maplab_py.viewer.layers.clouds import Cloud
 from maplab_py.viewer.options import PointCloudOptions
-from maplab_py.viewer.scene import WHOLE_MAP
 from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap, mission_sensor_id, to_hex
 
 _MM = 1e-3
@@ -119,7 +116,7 @@ def _of_depth_map(
     v, u = np.nonzero(depth[::step, ::step])
     uv = step * np.stack([u, v], axis=1)
     scale = np.array([camera.width_px / depth.shape[1], camera.height_px / depth.shape[0]])
-    rays, valid = back_project(camera, uv * scale)
+    rays, valid = projection.back_project(camera, uv * scale)
     z = _MM * depth[uv[:, 1], uv[:, 0]].astype(np.float64)
     keep = valid & (rays[:, 2] > 0.0)
     p_C = rays[keep] / rays[keep, 2:] * z[keep, None]
@@ -147,7 +144,7 @@ def resource_pose(vi_map: VIMap, row: int) -> F64:
     if kind == ResourceOwner.SENSOR:
         mission_vertices = slice(*vi_map.vertex_start[mission : mission + 2].tolist())
         times = vi_map.vertices.timestamp_ns[mission_vertices]
-        T_G_I, _ = interpolate_poses(
+        T_G_I, _ = interpolation.interpolate_poses(
             times, vi_map.T_G_I[mission_vertices], resources.timestamp_ns[row : row + 1]
         )
         imu_id = mission_sensor_id(vi_map, mission, MissionSensor.IMU)
@@ -165,7 +162,7 @@ def _mission_of(vi_map: VIMap, row: int) -> int:
 
 def _mission_id(vi_map: VIMap, row: int) -> str:
     mission = _mission_of(vi_map, row)
-    return to_hex(vi_map.missions.id[mission]) if mission >= 0 else WHOLE_MAP
+    return to_hex(vi_map.missions.id[mission]) if mission >= 0 else scene.WHOLE_MAP
 
 
 def _vertex_of(vi_map: VIMap, row: int) -> int:

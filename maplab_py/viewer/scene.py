@@ -4,8 +4,6 @@ Positions are float32 and relative to the scene's origin, which lies in the midd
 the map is far from the origin of G, so that nothing is lost to rounding.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping
 from enum import Enum

@@ -1,7 +1,5 @@
 """Nearest descriptors of a database, by an inverted multi-index."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import NamedTuple
 

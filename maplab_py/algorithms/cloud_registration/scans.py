@@ -1,7 +1,5 @@
 """Scans of missions, and pairs of scans that may overlap."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from functools import lru_cache

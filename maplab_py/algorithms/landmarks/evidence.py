@@ -4,8 +4,6 @@ It is kept in a field of the landmark's message that other programs skip. Sessio
 session places, not images: images of one place fail for the same reason.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -5,8 +5,6 @@ by others. A closure predicts where the landmarks of its place are in the images
 similar descriptor suffices.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

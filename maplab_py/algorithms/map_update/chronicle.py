@@ -4,8 +4,6 @@ A record is a text among the resources of the newest mission: its report, and th
 as differences from those after it. Rows of a column that both maps hold are numbers of rows.
 """
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import hashlib

@@ -18,8 +18,7 @@ from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, yaw
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import VIMap, observer_counts
-from maplab_py.vimap.edits import merge_landmarks, survivors
+from maplab_py.vimap import VIMap, edits, observer_counts
 
 _AGREE_M, _AGREE_RAD = 1.0, np.deg2rad(10.0)
 """Differences of localised poses from the aligned trajectory: the odometry of the session drifts."""
@@ -115,10 +114,10 @@ def with_matches(vi_map: VIMap, keypoint: I64, landmark: I64) -> tuple[VIMap, in
     _, first = np.unique(pairs[0], return_index=True)
     enough = votes[first] >= np.minimum(observer_counts(vi_map)[pairs[0, first]], _MIN_VOTES)
     source, target = pairs[:, first[enough]]
-    survivor = survivors(source, target, len(vi_map.landmarks))
+    survivor = edits.survivors(source, target, len(vi_map.landmarks))
     absorbed = np.flatnonzero(survivor != np.arange(len(survivor)))
     inherited = with_inherited(vi_map, absorbed, survivor[absorbed])
-    return merge_landmarks(inherited, source, target), len(absorbed)
+    return edits.merge_landmarks(inherited, source, target), len(absorbed)
 
 
 def _with_observations(vi_map: VIMap, keypoint: I64, landmark: I64) -> VIMap:

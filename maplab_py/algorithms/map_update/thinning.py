@@ -8,12 +8,8 @@ import numpy as np
 from maplab_py.algorithms.landmarks.evidence import read_evidence
 from maplab_py.algorithms.landmarks.persistence import PersistenceOptions, existence
 from maplab_py.algorithms.map_update.options import UpdateOptions
+from maplab_py.algorithms.sparsification import selection
 from maplab_py.algorithms.sparsification.options import SparsificationOptions
-from maplab_py.algorithms.sparsification.selection import (
-    CoverageProblem,
-    choose_greedily,
-    level_values,
-)
 from maplab_py.algorithms.sparsification.sparsify import sparsify
 from maplab_py.algorithms.statistics.statistics import bytes_by_kind
 from maplab_py.array_types import F64, I64, Mask, NDArray
@@ -28,19 +24,14 @@ from maplab_py.vimap import (
     TransformationEdges,
     TransformationKind,
     VIMap,
+    edits,
     from_hex,
     mission_sensor_id,
     random_ids,
+    tables,
     to_hex,
+    vertex_removal,
 )
-from maplab_py.vimap.edits import (
-    content_rng,
-    remove_keypoints,
-    remove_landmarks,
-    remove_missions,
-)
-from maplab_py.vimap.tables import Backbone, ImuEdges, ImuSamples
-from maplab_py.vimap.vertex_removal import remove_vertices
 
 _MIN_MISSES = 2
 """Sessions that missed a landmark before it counts as vanished, however unlikely it is."""
@@ -87,7 +78,7 @@ def thin(
     """
     vanished = vanished_landmarks(vi_map, options, persistence)
     before = len(vi_map.landmarks)
-    vi_map = remove_landmarks(vi_map, vanished)
+    vi_map = edits.remove_landmarks(vi_map, vanished)
     start, ids = vi_map, vi_map.missions.id[new]
     landmarks = options.max_landmarks or len(vi_map.landmarks)
     vertices = options.max_vertices or len(vi_map.vertices)
@@ -152,14 +143,14 @@ def _within(
     mission = vi_map.vertices.mission
     emptied = np.bincount(mission[kept], minlength=len(vi_map.missions)) == 0
     ids = vi_map.vertices.id[kept]
-    vi_map = remove_missions(vi_map, emptied)
+    vi_map = edits.remove_missions(vi_map, emptied)
     removed = np.ones(len(vi_map.vertices), dtype=np.bool_)
     removed[vi_map.vertex_index.rows(ids)] = False
     is_new = vi_map.mission_index.rows(new_missions)
     old = np.setdiff1d(vi_map.vertices.mission[removed], is_new)
-    vi_map = with_odometry_instead_of_imu(remove_vertices(vi_map, removed), old)
-    vi_map = remove_keypoints(vi_map, vi_map.keypoints.landmark < 0)
-    return remove_landmarks(vi_map, np.diff(vi_map.observation_start) == 0), len(old)
+    vi_map = with_odometry_instead_of_imu(vertex_removal.remove_vertices(vi_map, removed), old)
+    vi_map = edits.remove_keypoints(vi_map, vi_map.keypoints.landmark < 0)
+    return edits.remove_landmarks(vi_map, np.diff(vi_map.observation_start) == 0), len(old)
 
 
 def choose_vertices(vi_map: VIMap, keep: int, min_observers: int) -> Mask:
@@ -174,18 +165,18 @@ def choose_vertices(vi_map: VIMap, keep: int, min_observers: int) -> Mask:
     landmark = pairs % count
     observers = np.bincount(landmark, minlength=count).astype(np.float64)
     _, age = np.unique(vi_map.vertices.timestamp_ns, return_inverse=True)
-    problem = CoverageProblem(
+    problem = selection.CoverageProblem(
         keyframe=landmark,
         landmark=pairs // count,
         score=np.asarray(age.reshape(-1) / max(int(age.max(initial=0)), 1), dtype=np.float64),
         weight=np.ones(len(vi_map.vertices)),
         wanted=np.minimum(observers, min_observers),
         base=np.zeros(count),
-        level_value=level_values(min_observers),
+        level_value=selection.level_values(min_observers),
         full=float(min_observers),
         keep=min(keep, len(vi_map.vertices)),
     )
-    return choose_greedily(problem)
+    return selection.choose_greedily(problem)
 
 
 def with_odometry_instead_of_imu(vi_map: VIMap, missions: I64) -> VIMap:
@@ -193,7 +184,7 @@ def with_odometry_instead_of_imu(vi_map: VIMap, missions: I64) -> VIMap:
 
     Inertial measurements over the long gaps of a thinned mission weigh much and tell little.
     """
-    missions = missions[vi_map.missions.backbone[missions] == Backbone.VIWLS]
+    missions = missions[vi_map.missions.backbone[missions] == tables.Backbone.VIWLS]
     if len(missions) == 0:
         return vi_map
     is_old = np.zeros(len(vi_map.missions), dtype=np.bool_)
@@ -206,12 +197,12 @@ def with_odometry_instead_of_imu(vi_map: VIMap, missions: I64) -> VIMap:
     samples = np.repeat(~dropped, vi_map.imu_edges.sample_count)
     sensor_id = vi_map.missions.sensor_id.copy()
     sensor_id[missions, MissionSensor.ODOMETRY_6DOF] = of_mission[missions]
-    backbone = np.where(is_old, Backbone.ODOMETRY, vi_map.missions.backbone)
+    backbone = np.where(is_old, tables.Backbone.ODOMETRY, vi_map.missions.backbone)
     return vi_map.replace(
         sensors=sensors,
         missions=vi_map.missions.replace(backbone=backbone, sensor_id=sensor_id),
-        imu_edges=ImuEdges.concatenate([vi_map.imu_edges.take(~dropped)]),
-        imu_samples=ImuSamples.concatenate([vi_map.imu_samples.take(samples)]),
+        imu_edges=tables.ImuEdges.concatenate([vi_map.imu_edges.take(~dropped)]),
+        imu_samples=tables.ImuSamples.concatenate([vi_map.imu_samples.take(samples)]),
         transformation_edges=TransformationEdges.concatenate([vi_map.transformation_edges, edges]),
     )
 
@@ -239,7 +230,7 @@ def _odometry_edges(vi_map: VIMap, first: I64, sensor_id: NDArray[Any]) -> Trans
     covariance: F64 = np.square(diagonal)[:, :, None] * np.eye(6)
     return TransformationEdges.filled(
         len(first),
-        id=random_ids(len(first), content_rng(vi_map, "odometry edges")),
+        id=random_ids(len(first), edits.content_rng(vi_map, "odometry edges")),
         kind=np.full(len(first), TransformationKind.ODOMETRY),
         from_vertex=first,
         to_vertex=first + 1,

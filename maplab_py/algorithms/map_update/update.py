@@ -8,6 +8,7 @@ import numpy as np
 from maplab_py.algorithms.anchoring.anchoring import anchor_missions
 from maplab_py.algorithms.keyframing.heuristic import keyframe
 from maplab_py.algorithms.keyframing.options import KeyframingOptions
+from maplab_py.algorithms.landmarks import tracks, triangulation
 from maplab_py.algorithms.landmarks.evidence import (
     add_session,
     birth_times_s,
@@ -23,16 +24,12 @@ from maplab_py.algorithms.landmarks.persistence import (
     summarise_oldest,
 )
 from maplab_py.algorithms.landmarks.quality import evaluate_quality
-from maplab_py.algorithms.landmarks.tracks import init_tracks
-from maplab_py.algorithms.landmarks.triangulation import retriangulate
 from maplab_py.algorithms.localization.database import database_of_map
 from maplab_py.algorithms.localization.localization import localize_missions
 from maplab_py.algorithms.localization.options import LocalizationOptions
-from maplab_py.algorithms.loop_closure.features import ProjectionMemory, SearchScope
+from maplab_py.algorithms.loop_closure import features, workflow
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.algorithms.loop_closure.workflow import close_loops
-from maplab_py.algorithms.map_update.changes import find_changes
-from maplab_py.algorithms.map_update.chronicle import on_newest_mission, stored_order, with_record
+from maplab_py.algorithms.map_update import changes, chronicle, placing, thinning, visibility
 from maplab_py.algorithms.map_update.options import (
     ChangeReport,
     EvidenceReport,
@@ -40,19 +37,13 @@ from maplab_py.algorithms.map_update.options import (
     MapUpdateReport,
     UpdateOptions,
 )
-from maplab_py.algorithms.map_update.placing import Placed, place, with_matches
-from maplab_py.algorithms.map_update.thinning import size_mb, thin
-from maplab_py.algorithms.map_update.visibility import main_feature_type, outcome, predict
-from maplab_py.algorithms.vi_optimization.local import optimize_around
-from maplab_py.algorithms.vi_optimization.optimization import optimize
+from maplab_py.algorithms.vi_optimization import local, optimization
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.array_types import I64, NDArray
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import counted
-from maplab_py.vimap import IdArray, VIMap, to_hex
-from maplab_py.vimap.edits import content_rng, with_new_ids
-from maplab_py.vimap.merge import check_disjoint, merge_maps
+from maplab_py.vimap import IdArray, VIMap, edits, merge, to_hex
 
 _FIRST_ITERATIONS, _LOCAL_ITERATIONS = 10, 8
 _FREE, _FIXED = 150, 150
@@ -76,11 +67,11 @@ def prepare_session(
         EstimationError: Nothing can be optimised.
     """
     steps = (
-        lambda m: init_tracks(m, LandmarkQualityOptions()),
-        lambda m: retriangulate(m, LandmarkQualityOptions()),
+        lambda m: tracks.init_tracks(m, LandmarkQualityOptions()),
+        lambda m: triangulation.retriangulate(m, LandmarkQualityOptions()),
         lambda m: keyframe(m, keyframing),
         lambda m: evaluate_quality(m, LandmarkQualityOptions(min_observers=_MIN_OBSERVERS)),
-        lambda m: optimize(
+        lambda m: optimization.optimize(
             m, VIOptimizationOptions(num_iterations=_FIRST_ITERATIONS), progress=progress
         ),
     )
@@ -119,11 +110,11 @@ def update_map(
     """
     _check_anchored(vi_map)
     if assign_new_ids:
-        session = with_new_ids(session, content_rng(vi_map, "update", session))
-    check_disjoint(vi_map, session)
+        session = edits.with_new_ids(session, edits.content_rng(vi_map, "update", session))
+    merge.check_disjoint(vi_map, session)
     prepared = prepare_session(session, keyframing, progress=progress)
     whole, merged, localized = merge_session(vi_map, prepared, loops, progress=progress)
-    whole = on_newest_mission(whole)
+    whole = chronicle.on_newest_mission(whole)
     lines = []
     new_ids = prepared.missions.id
     for mission in whole.mission_index.rows(new_ids).tolist():
@@ -131,8 +122,8 @@ def update_map(
         lines.append(line)
     is_new = np.zeros(len(whole.missions), dtype=np.bool_)
     is_new[whole.mission_index.rows(new_ids)] = True
-    result, thinned = thin(whole, is_new, options, persistence, progress)
-    result = stored_order(result)
+    result, thinned = thinning.thin(whole, is_new, options, persistence, progress)
+    result = chronicle.stored_order(result)
     report = MapUpdateReport(
         sessions=tuple(lines),
         vertices_before=len(vi_map.vertices),
@@ -147,8 +138,8 @@ def update_map(
         landmarks_after=len(result.landmarks),
         missions_removed=thinned.missions,
         missions_without_imu=thinned.missions_without_imu,
-        megabytes_before=size_mb(vi_map),
-        megabytes_after=size_mb(result),
+        megabytes_before=thinning.size_mb(vi_map),
+        megabytes_after=thinning.size_mb(result),
         localized_before=localized,
         localized_after=_localized(result, prepared, progress),
         notes=tuple(
@@ -157,7 +148,7 @@ def update_map(
             if line.predicted == 0
         ),
     )
-    return with_record(vi_map, result, report), report
+    return chronicle.with_record(vi_map, result, report), report
 
 
 def _localized(vi_map: VIMap, session: VIMap, progress: Progress) -> float:
@@ -167,7 +158,7 @@ def _localized(vi_map: VIMap, session: VIMap, progress: Progress) -> float:
     if not known.any():
         return 0.0
     database = database_of_map(
-        vi_map, missions=np.flatnonzero(known), feature_type=main_feature_type(vi_map)
+        vi_map, missions=np.flatnonzero(known), feature_type=visibility.main_feature_type(vi_map)
     )
     localized = localize_missions(database, session, LocalizationOptions(), progress=progress)
     return float(localized.is_localized.mean())
@@ -189,20 +180,20 @@ def merge_session(
     Returns:
         The map, the landmarks merged, and the share of the session's vertices that were localised.
     """
-    placed = place(vi_map, session, progress)
-    whole, _ = merge_maps(vi_map, _at_place(session, placed))
+    placed = placing.place(vi_map, session, progress)
+    whole, _ = merge.merge_maps(vi_map, _at_place(session, placed))
     ids = session.missions.id
     if len(placed.missions) < len(session.missions):
         whole = _anchored(whole, ids, loops, progress)
     landmark = whole.landmark_index.rows(vi_map.landmarks.id[placed.landmark])
     # the keypoints of the session follow those of the map
     keypoint = placed.keypoint + len(vi_map.keypoints)
-    whole, merged = with_matches(whole, keypoint[landmark >= 0], landmark[landmark >= 0])
+    whole, merged = placing.with_matches(whole, keypoint[landmark >= 0], landmark[landmark >= 0])
     whole = _optimized(whole, ids, progress)
     for mission in whole.mission_index.rows(ids).tolist():
-        seen = predict(whole, mission, progress)
+        seen = visibility.predict(whole, mission, progress)
         matched = seen.keypoint >= 0
-        whole, count = with_matches(whole, seen.keypoint[matched], seen.landmark[matched])
+        whole, count = placing.with_matches(whole, seen.keypoint[matched], seen.landmark[matched])
         merged += count
     whole = _optimized(whole, ids, progress)
     quality = LandmarkQualityOptions(min_observers=_MIN_OBSERVERS)
@@ -228,12 +219,12 @@ def changes_since(
             "the other map is in the selected one: --changes needs one of another session"
         )
     if shared:
-        session = with_new_ids(session, content_rng(vi_map, "changes", session))
+        session = edits.with_new_ids(session, edits.content_rng(vi_map, "changes", session))
     prepared = prepare_session(session, progress=progress)
     whole, *_ = merge_session(vi_map, prepared, progress=progress)
     later = np.zeros(len(whole.missions), dtype=np.bool_)
     later[whole.mission_index.rows(prepared.missions.id)] = True
-    return whole, find_changes(whole, later, progress)
+    return whole, changes.find_changes(whole, later, progress)
 
 
 def _check_anchored(vi_map: VIMap) -> None:
@@ -244,7 +235,7 @@ def _check_anchored(vi_map: VIMap) -> None:
         )
 
 
-def _at_place(session: VIMap, placed: Placed) -> VIMap:
+def _at_place(session: VIMap, placed: placing.Placed) -> VIMap:
     """Return a session with the base frames of placed missions known, all others unknown."""
     rows = session.missions.baseframe[placed.missions]
     T_G_M = session.baseframes.T_G_M.copy()
@@ -265,8 +256,8 @@ def _anchored(
             f"mission {to_hex(whole.missions.id[unknown[0]])[:8]} of the session cannot be anchored "
             f"in the map: {report.failure or 'too few places are recognised'}"
         )
-    scope = SearchScope(np.isin(whole.vertices.mission, rows), ProjectionMemory())
-    return close_loops(whole, loops, scope=scope, progress=progress)[0]
+    scope = features.SearchScope(np.isin(whole.vertices.mission, rows), features.ProjectionMemory())
+    return workflow.close_loops(whole, loops, scope=scope, progress=progress)[0]
 
 
 def _optimized(whole: VIMap, missions: IdArray, progress: Progress) -> VIMap:
@@ -276,7 +267,7 @@ def _optimized(whole: VIMap, missions: IdArray, progress: Progress) -> VIMap:
         hide_iterations_console_output=True,
         include_6dof_odometry=True,
     )
-    return optimize_around(
+    return local.optimize_around(
         whole, rows, options, max_free=_FREE, max_fixed=_FIXED, progress=progress
     )[0]
 
@@ -298,7 +289,9 @@ def gather(
     """
     before, born = read_evidence(vi_map), birth_times_s(vi_map)
     before["born_s"] = np.where(before["born_s"] > 0, before["born_s"], born)
-    session, false_match = outcome(vi_map, mission, predict(vi_map, mission, progress))
+    session, false_match = visibility.outcome(
+        vi_map, mission, visibility.predict(vi_map, mission, progress)
+    )
     session = session.take(before["born_s"][session.landmark] < session.time_s)
     detection = learn_detection(before, persistence)
     _, full = add_session(before, session)
@@ -338,7 +331,7 @@ def gather_all(
     whole, chosen = vi_map, vi_map.missions.id
     if session is not None:
         _check_anchored(vi_map)
-        session = with_new_ids(session, content_rng(vi_map, "evidence", session))
+        session = edits.with_new_ids(session, edits.content_rng(vi_map, "evidence", session))
         prepared = prepare_session(session, progress=progress)
         whole, *_ = merge_session(vi_map, prepared, progress=progress)
         chosen = prepared.missions.id

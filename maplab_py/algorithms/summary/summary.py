@@ -5,13 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from maplab_py.algorithms.landmarks.evidence import (
-    has_evidence,
-    read_evidence,
-    session_times_s,
-)
-from maplab_py.algorithms.landmarks.persistence import PersistenceOptions, existence
-from maplab_py.algorithms.landmarks.quality import evaluate_unknown_quality
+from maplab_py.algorithms.landmarks import evidence, persistence, quality
 from maplab_py.algorithms.localization.database import features_of_good_landmarks
 from maplab_py.algorithms.loop_closure.features import MapFeatures, map_features
 from maplab_py.algorithms.summary.options import SummaryMapContent, SummaryMapOptions
@@ -53,7 +47,7 @@ def make_summary_map(
     Raises:
         EstimationError: No good landmark has descriptors of the type, or too few tracks to learn from.
     """
-    judged, _ = evaluate_unknown_quality(vi_map, progress)
+    judged, _ = quality.evaluate_unknown_quality(vi_map, progress)
     progress.step(0, 3, "project descriptors")
     missions = np.arange(len(judged.missions))
     features, projection = map_features(
@@ -105,10 +99,12 @@ def make_summary_map(
 
 def _existence_percent(vi_map: VIMap, landmarks: I64) -> U8 | None:
     """Return the probability (N,) that landmarks (rows) exist; None without evidence."""
-    if not has_evidence(vi_map):
+    if not evidence.has_evidence(vi_map):
         return None
-    now = float(session_times_s(vi_map).max())
-    exists = existence(read_evidence(vi_map), PersistenceOptions(), at_s=now)
+    now = float(evidence.session_times_s(vi_map).max())
+    exists = persistence.existence(
+        evidence.read_evidence(vi_map), persistence.PersistenceOptions(), at_s=now
+    )
     return np.round(100.0 * exists[landmarks]).astype(np.uint8)
 
 

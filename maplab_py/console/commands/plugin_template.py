@@ -33,8 +33,6 @@ packages = ["$package"]
 _MODULE = '''\
 """Commands of the plugin $name."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

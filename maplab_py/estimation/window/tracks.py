@@ -1,7 +1,5 @@
 """Tracks in the window: their observations, and those of them that are landmarks."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -17,9 +17,8 @@ from maplab_py.estimation.kernels.window_arguments import (
 )
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.symbolic import sources
-from maplab_py.estimation.window import cameras, map_terms
+from maplab_py.estimation.window import cameras, inertial, map_terms
 from maplab_py.estimation.window.calibration import FrameTimes, WindowCalibration
-from maplab_py.estimation.window.inertial import InertialChain
 from maplab_py.estimation.window.states import WindowStates
 from maplab_py.geometry import se3
 from maplab_py.sensors import Camera, Distortion, Imu, Projection
@@ -95,7 +94,7 @@ def _run_frames() -> None:
     origin, start = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), np.array([0, 2], dtype=np.int64)
     ray = np.array([[0.0, 0.0, 1.0], [-0.6, 0.0, 0.8]])
     kernels.triangulate(origin, ray, start, np.empty((1, 3)), np.empty(1, dtype=np.bool_))
-    chain = InertialChain(residual_kernel("inertial", sources.inertial), Imu("0" * 32))
+    chain = inertial.InertialChain(residual_kernel("inertial", sources.inertial), Imu("0" * 32))
     chain.append(1_000_000 * np.arange(2), np.ones((2, 6)), states.motion[0], is_resting=False)
     chain.relinearize(states.motion)
     kernels.group(start, start[:1], 3, start.copy(), start.copy())

@@ -1,7 +1,5 @@
 """Signs of a camera that is covered, frozen or out of focus, compared with what it has shown before."""
 
-from __future__ import annotations
-
 import collections
 
 import numpy as np

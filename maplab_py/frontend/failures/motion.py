@@ -5,8 +5,6 @@ landmarks as they were known at the first of them. The turn between the outer on
 gyroscope's, the second difference of the positions with the accelerometer's: neither needs a velocity.
 """
 
-from __future__ import annotations
-
 import collections
 import dataclasses
 

@@ -1,7 +1,5 @@
 """Signs of an IMU whose axes repeat a value: stuck, or at a limit that the calibration does not know."""
 
-from __future__ import annotations
-
 import collections
 
 import numpy as np

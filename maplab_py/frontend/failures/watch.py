@@ -1,7 +1,5 @@
 """Sensors that are left out: found by their signs, until they are whole again."""
 
-from __future__ import annotations
-
 import collections
 import dataclasses
 from collections.abc import Iterable

@@ -7,8 +7,6 @@ Frame-to-Frame Rotation, ICCV 2013, with the bias in place of the rotation as in
 Rotation-Translation-Decoupled Solution for Robust and Efficient Visual-Inertial Initialization, CVPR 2023.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from functools import cached_property
 
@@ -17,13 +15,7 @@ import numpy as np
 from maplab_py.array_types import F64, I64
 from maplab_py.estimation.imu.inertial_data import InertialData
 from maplab_py.estimation.imu.preintegration import integrate
-from maplab_py.frontend.initialization.gyro_bias_kernels import (
-    BiasSums,
-    PairedRays,
-    accumulate_turns,
-    add_equations,
-    add_scatter,
-)
+from maplab_py.frontend.initialization import gyro_bias_kernels
 from maplab_py.frontend.initialization.rays import SegmentRays
 from maplab_py.geometry import so3
 from maplab_py.vimap.table import starts_of_counts
@@ -53,7 +45,9 @@ def integrate_turns(inertial: InertialData, gyro_bias: F64) -> Turns:
     """Integrate the gyroscope over consecutive edges."""
     edges = integrate(inertial, gyro_bias, np.zeros(3))
     turns = Turns(so3.identity(len(inertial) + 1), np.zeros((len(inertial) + 1, 3, 3)))
-    accumulate_turns(edges.q_A_B, edges.jacobian_gyro_bias, turns.q_A_I, turns.jacobian)
+    gyro_bias_kernels.accumulate_turns(
+        edges.q_A_B, edges.jacobian_gyro_bias, turns.q_A_I, turns.jacobian
+    )
     return turns
 
 
@@ -202,12 +196,12 @@ def gauss_newton_step(
         by_delay = rate[j][:, :, None] - R_j_i @ rate[i][:, :, None]
         slope = np.ascontiguousarray(np.concatenate([slope, by_delay], axis=2))
         sigma = np.append(sigma, _PRIOR_DELAY_S)
-    rays = PairedRays(pairs.first, pairs.second, pairs.sigma, pairs.start)
+    rays = gyro_bias_kernels.PairedRays(pairs.first, pairs.second, pairs.sigma, pairs.start)
     normal, scatter = np.empty_like(pairs.first), np.zeros((count, 3, 3))
-    add_scatter(rays, R_i_j, weight, normal, scatter)
+    gyro_bias_kernels.add_scatter(rays, R_i_j, weight, normal, scatter)
     direction = np.linalg.eigh(scatter)[1]  # ascending: the first is that of translation
-    weight, sums = np.empty_like(weight), BiasSums.zeros(count, len(sigma))
-    add_equations(rays, R_i_j, slope, direction, normal, weight, sums)
+    weight, sums = np.empty_like(weight), gyro_bias_kernels.BiasSums.zeros(count, len(sigma))
+    gyro_bias_kernels.add_equations(rays, R_i_j, slope, direction, normal, weight, sums)
     eliminated = sums.H_bt @ np.linalg.inv(sums.H_tt + 1e-9 * np.eye(2))
     H = sums.H_bb - np.einsum("pij,pkj->ik", eliminated, sums.H_bt)
     g = sums.g_b - np.einsum("pij,pj->i", eliminated, sums.g_t)
@@ -222,5 +216,7 @@ def compile_kernels() -> None:
     first, second, pair = np.array([0]), np.array([1]), np.zeros(2, dtype=np.int64)
     pairs = RayPairs(first, second, pair, rays, rays[::-1].copy(), np.full(2, 1e-3))
     turns = Turns(so3.identity(2), np.zeros((2, 3, 3)))
-    accumulate_turns(turns.q_A_I[:1], np.zeros((1, 9, 3)), turns.q_A_I, turns.jacobian)
+    gyro_bias_kernels.accumulate_turns(
+        turns.q_A_I[:1], np.zeros((1, 9, 3)), turns.q_A_I, turns.jacobian
+    )
     gauss_newton_step(pairs, turns, np.ones(2), np.zeros(3))

@@ -1,7 +1,5 @@
 """Noise of the samples of an IMU, by their residuals: data sheets leave out vibrations."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

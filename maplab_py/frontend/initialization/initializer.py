@@ -1,7 +1,5 @@
 """Decides when the estimator may start, and from which state."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -9,11 +7,9 @@ import numpy as np
 from maplab_py.errors import UserError
 from maplab_py.estimation.linear.threads import single_thread
 from maplab_py.estimation.window.frame import WindowFrame
+from maplab_py.frontend.initialization import paced_work, segment, standstill
 from maplab_py.frontend.initialization.motion import Attempt, Limits, MotionStart, accel_bias_sigma
 from maplab_py.frontend.initialization.options import InitializationOptions
-from maplab_py.frontend.initialization.paced_work import PacedWork
-from maplab_py.frontend.initialization.segment import History
-from maplab_py.frontend.initialization.standstill import motionlessness, start_at_rest
 from maplab_py.frontend.starting import Start
 from maplab_py.interop.recordings.protocol import RecordedSensors
 from maplab_py.vision.tracking.views import focal_length_px
@@ -37,7 +33,7 @@ class _Pending:
     """An attempt in motion under way."""
 
     frame: WindowFrame  # whose state it looks for
-    work: PacedWork[Attempt]
+    work: paced_work.PacedWork[Attempt]
     limits: Limits
     waited_s: float  # when it began
     early_s: float  # until larger deviations are allowed
@@ -67,7 +63,7 @@ class Initializer:
         self._options = options or InitializationOptions()
         self._imu = device.imu
         self._focal_px = min(focal_length_px(camera) for camera in device.cameras)
-        self._history = History(self._options.longest_s + 1e-3)
+        self._history = segment.History(self._options.longest_s + 1e-3)
         self._motion = MotionStart(device.cameras, device.T_I_C, device.imu, self._options)
         self._first_ns: int | None = None
         self._next_ns = -1  # time before which there is no further attempt
@@ -88,12 +84,14 @@ class Initializer:
         duration_s = (frames[-1].time_ns - frames[0].time_ns) * 1e-9
         if duration_s >= options.rest_s - 0.5 * duration_s / max(len(frames) - 1, 1):
             times_ns, accel_gyro = history.samples(options.rest_s + 1e-3)
-            seen = motionlessness(frames, accel_gyro)
+            seen = standstill.motionlessness(frames, accel_gyro)
             if seen.is_rest(options):
                 self.reason = ""
                 sigma = accel_bias_sigma(self._imu, options)
                 rate_radps = seen.rate_radps(self._focal_px)
-                state = start_at_rest(self._imu, times_ns, accel_gyro, sigma, rate_radps=rate_radps)
+                state = standstill.start_at_rest(
+                    self._imu, times_ns, accel_gyro, sigma, rate_radps=rate_radps
+                )
                 return Start(frame, state, is_resting=True)
         if self._pending is None:
             self._pending = self._begin(frame)
@@ -103,7 +101,7 @@ class Initializer:
 
     def replace_frames(self, frames: list[WindowFrame]) -> None:
         """Exchange all frames so far by the same with other times."""
-        self._history = History(self._options.longest_s + 1e-3)
+        self._history = segment.History(self._options.longest_s + 1e-3)
         for frame in frames:
             self._history.push(frame)
         self._first_ns = frames[0].time_ns if frames else None
@@ -132,7 +130,7 @@ class Initializer:
             limits = dataclasses.replace(
                 limits, scale_sigma=min(limits.scale_sigma, options.early_scale_sigma)
             )
-        work = PacedWork(
+        work = paced_work.PacedWork(
             self._motion.solving(history.segment(self._motion.imu, interval_s), limits)
         )
         return _Pending(frame, work, limits, waited_s, early_s, history.duration_s)

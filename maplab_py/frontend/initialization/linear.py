@@ -9,8 +9,6 @@ Unknown Camera-IMU Calibration, IROS 2012; A. Martinelli, Closed-Form Solution o
 Structure from Motion, IJCV 106(2), 2014.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

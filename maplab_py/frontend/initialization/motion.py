@@ -1,7 +1,5 @@
 """Start in motion: gyroscope bias, closed form, refinement, and what is still unknown afterwards."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -10,23 +8,15 @@ from maplab_py.array_types import F64, I64
 from maplab_py.estimation.linear.threads import single_thread
 from maplab_py.estimation.window.frame import StartState
 from maplab_py.estimation.window.states import WindowStates
+from maplab_py.frontend.initialization import imu_noise, linear, paced_work, refinement
 from maplab_py.frontend.initialization.gyro_bias import (
     Turns,
     estimate_gyro_bias,
     integrate_turns,
     ray_pairs,
 )
-from maplab_py.frontend.initialization.imu_noise import with_least_noise
-from maplab_py.frontend.initialization.linear import LinearMotion, solve_motion
 from maplab_py.frontend.initialization.options import InitializationOptions
-from maplab_py.frontend.initialization.paced_work import Work, finished
 from maplab_py.frontend.initialization.rays import RayMaker, SegmentRays
-from maplab_py.frontend.initialization.refinement import (
-    BiasSigmas,
-    Refined,
-    Refinement,
-    mission_frame,
-)
 from maplab_py.frontend.initialization.segment import Segment
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Camera, Imu
@@ -57,7 +47,7 @@ class Attempt:
 
     state: StartState | None
     reason: str  # empty when there is a state
-    refined: Refined | None = None  # what the state was taken from
+    refined: refinement.Refined | None = None  # what the state was taken from
     provisional: StartState | None = None  # a state of which much is only expected
     scale_sigma: float = 0.0  # with that state
 
@@ -71,20 +61,20 @@ class MotionStart:
         """Prepare for cameras with poses T_I_C (C, 7) on the IMU."""
         self._options = options
         # vibrations and errors of scale are not in the densities of a data sheet
-        self.imu = with_least_noise(
+        self.imu = imu_noise.with_least_noise(
             imu, options.least_gyro_noise_density, options.least_accel_noise_density
         )
         self._rays = RayMaker(cameras, T_I_C)
         self._accel_bias_sigma = accel_bias_sigma(imu, options)
-        biases = BiasSigmas(options.gyro_bias_sigma_radps, self._accel_bias_sigma)
-        self._refinement = Refinement(cameras, T_I_C, self.imu, biases, imu)
+        biases = refinement.BiasSigmas(options.gyro_bias_sigma_radps, self._accel_bias_sigma)
+        self._refinement = refinement.Refinement(cameras, T_I_C, self.imu, biases, imu)
 
     def solve(self, segment: Segment, limits: Limits | None = None) -> Attempt:
         """Estimate the state of the last frame of a segment; see `solving`."""
         with single_thread():
-            return finished(self.solving(segment, limits))
+            return paced_work.finished(self.solving(segment, limits))
 
-    def solving(self, segment: Segment, limits: Limits | None = None) -> Work[Attempt]:
+    def solving(self, segment: Segment, limits: Limits | None = None) -> paced_work.Work[Attempt]:
         """Estimate the state of the last frame of a segment in parts.
 
         Args:
@@ -105,7 +95,7 @@ class MotionStart:
         yield _GYRO_BIAS_UNITS
         turns = integrate_turns(segment.inertial, gyro_bias)
         sigma = self._accel_bias_sigma
-        motion = solve_motion(segment.inertial, turns, gyro_bias, rays, sigma)
+        motion = linear.solve_motion(segment.inertial, turns, gyro_bias, rays, sigma)
         if motion is None:
             return Attempt(
                 None,
@@ -131,7 +121,7 @@ class MotionStart:
             None, reason, refined, _start_state(segment.time_ns[-1:], refined), refined.scale_sigma
         )
 
-    def _is_plausible(self, refined: Refined) -> bool:
+    def _is_plausible(self, refined: refinement.Refined) -> bool:
         """Tell whether the estimator may go on from a state, however uncertain its scale."""
         return (
             refined.num_landmarks >= self._options.min_landmarks
@@ -140,7 +130,9 @@ class MotionStart:
             and refined.scale_sigma <= _LEAST_KNOWN_SCALE
         )
 
-    def _objection(self, refined: Refined | None, rays: SegmentRays, limits: Limits) -> str:
+    def _objection(
+        self, refined: refinement.Refined | None, rays: SegmentRays, limits: Limits
+    ) -> str:
         """Return what is still unknown, empty when the estimator may start."""
         options = self._options
         if refined is None:
@@ -170,7 +162,7 @@ class MotionStart:
             )
         return ""
 
-    def _contradiction(self, refined: Refined) -> str:
+    def _contradiction(self, refined: refinement.Refined) -> str:
         """Return what images and samples say against each other; empty when they agree."""
         options = self._options
         if refined.median_error_px > options.max_error_px:
@@ -206,16 +198,16 @@ def shares_points(rays: SegmentRays) -> bool:
     return bool(np.count_nonzero(shared >= 10) >= 0.5 * max(frames, 1))
 
 
-def _states(turns: Turns, gyro_bias: F64, motion: LinearMotion) -> WindowStates:
+def _states(turns: Turns, gyro_bias: F64, motion: linear.LinearMotion) -> WindowStates:
     """Return the states of the frames in M."""
-    q_M_A, frames = mission_frame(motion.g_A), len(turns.q_A_I)
+    q_M_A, frames = refinement.mission_frame(motion.g_A), len(turns.q_A_I)
     T_M_I = se3.make(so3.multiply(q_M_A, turns.q_A_I), so3.rotate(q_M_A, motion.p_A))
     biases = np.tile(np.concatenate([gyro_bias, motion.accel_bias]), (frames, 1))
     velocity = so3.rotate(q_M_A, motion.v_A)
     return WindowStates(T_M_I, np.concatenate([velocity, biases], axis=1), np.zeros((0, 3)))
 
 
-def _start_state(time_ns: I64, refined: Refined) -> StartState:
+def _start_state(time_ns: I64, refined: refinement.Refined) -> StartState:
     """Return the state of the last frame, in a mission frame that begins there."""
     T_M_I, motion = refined.states.T_M_I[-1:].copy(), refined.states.motion[-1:]
     T_M_I[:, 4:] = 0.0

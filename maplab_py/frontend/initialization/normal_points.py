@@ -9,8 +9,6 @@ Source: the normal points of satellite laser ranging (A. T. Sinclair, Data Scree
 Formation, 1997).
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -21,8 +19,7 @@ from maplab_py.estimation.window.cameras import CameraPoses
 from maplab_py.estimation.window.states import WindowStates
 from maplab_py.frontend.initialization.segment import ObservedFrames, Segment
 from maplab_py.geometry import se3
-from maplab_py.sensors import Camera, Imu
-from maplab_py.sensors.projection import project
+from maplab_py.sensors import Camera, Imu, projection
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -127,7 +124,7 @@ def _differences(
     shift, is_visible = np.zeros((len(camera), 2)), np.zeros(len(camera), dtype=np.bool_)
     for number, model in enumerate(cameras):
         rows = np.flatnonzero(camera == number)
-        uv_there, in_there = project(model, there[rows])
-        uv_here, in_here = project(model, here[rows])
+        uv_there, in_there = projection.project(model, there[rows])
+        uv_here, in_here = projection.project(model, here[rows])
         shift[rows], is_visible[rows] = uv_here - uv_there, in_here & in_there
     return shift, is_visible

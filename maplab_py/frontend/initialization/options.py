@@ -1,7 +1,5 @@
 """Options of the initialisation."""
 
-from __future__ import annotations
-
 from maplab_py.errors import FlagError
 from maplab_py.options import Options, option
 

@@ -4,8 +4,6 @@ How much is done at a time is counted in units of work and not in time, so that 
 give the same results. A unit takes about a millisecond on an ordinary machine.
 """
 
-from __future__ import annotations
-
 from collections.abc import Generator
 from typing import Generic, TypeVar
 

@@ -1,7 +1,5 @@
 """The observations of a segment as rays in the frame of the IMU."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -10,8 +8,7 @@ from maplab_py.array_types import F64, I32, I64
 from maplab_py.frontend.initialization.segment import Segment
 from maplab_py.geometry import so3
 from maplab_py.sensors import Camera
-from maplab_py.vision.tracking.ray_table import RayTable
-from maplab_py.vision.tracking.views import focal_length_px
+from maplab_py.vision.tracking import ray_table, views
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -38,9 +35,9 @@ class RayMaker:
 
     def __init__(self, cameras: tuple[Camera, ...], T_I_C: F64) -> None:
         """Prepare for cameras with poses (C, 7) on the IMU."""
-        self._tables = [RayTable.of(camera) for camera in cameras]
+        self._tables = [ray_table.RayTable.of(camera) for camera in cameras]
         self._R_I_C, self._p_I_C = so3.to_matrix(T_I_C[:, :4]), T_I_C[:, 4:]
-        self._focal_px = np.array([focal_length_px(camera) for camera in cameras])
+        self._focal_px = np.array([views.focal_length_px(camera) for camera in cameras])
 
     def of(self, segment: Segment) -> SegmentRays:
         """Return the rays of a segment; pixels without rays are left out."""

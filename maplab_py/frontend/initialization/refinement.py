@@ -1,7 +1,5 @@
 """Least squares over all frames of a segment, and how well it determines the last of them."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -13,23 +11,15 @@ from maplab_py.estimation.linear.protocol import NotPositiveDefinite
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.problem.solver import SolverOptions, optimizing_states
 from maplab_py.estimation.symbolic import sources
-from maplab_py.estimation.window.calibration import WindowCalibration
+from maplab_py.estimation.window import calibration, inertial, triangulation
 from maplab_py.estimation.window.cameras import BackProjection, CameraPoses
 from maplab_py.estimation.window.factors import FrameFactors, Standstill
-from maplab_py.estimation.window.inertial import InertialChain
 from maplab_py.estimation.window.options import WindowOptions
 from maplab_py.estimation.window.prior import WindowPrior
 from maplab_py.estimation.window.problem import WindowProblem
 from maplab_py.estimation.window.states import WindowStates, scale_sigma
 from maplab_py.estimation.window.tracks import Observations, Tracks
-from maplab_py.estimation.window.triangulation import Triangulator
-from maplab_py.frontend.initialization.imu_noise import noise_factor, with_least_noise
-from maplab_py.frontend.initialization.normal_points import (
-    Landmarks,
-    Rig,
-    with_normal_points,
-)
-from maplab_py.frontend.initialization.paced_work import Work, each_step
+from maplab_py.frontend.initialization import imu_noise, normal_points, paced_work
 from maplab_py.frontend.initialization.segment import Segment
 from maplab_py.geometry import so3
 from maplab_py.progress import SILENT
@@ -102,7 +92,7 @@ class _Solved:
     """Result of a round."""
 
     problem: WindowProblem
-    chain: InertialChain
+    chain: inertial.InertialChain
     states: WindowStates
     imu: Imu
     tracks: Tracks  # whose landmarks are those of the states
@@ -129,8 +119,8 @@ class Refinement:
             biases: What is known of them.
             data_sheet: The IMU with the least noise that it can have.
         """
-        self._rig = Rig(cameras, T_I_C)
-        self._calibration = WindowCalibration.of(cameras, T_I_C)
+        self._rig = normal_points.Rig(cameras, T_I_C)
+        self._calibration = calibration.WindowCalibration.of(cameras, T_I_C)
         self._kernels = window_kernels()
         self._back_projection = BackProjection(self._kernels, self._calibration)
         self._inertial = residual_kernel("inertial", sources.inertial)
@@ -143,7 +133,7 @@ class Refinement:
 
     def refine(
         self, segment: Segment, states: WindowStates, *, wanted_scale_sigma: float = 0.0
-    ) -> Work[Refined | None]:
+    ) -> paced_work.Work[Refined | None]:
         """Refine the states (F) of a segment; the result is None when they are not determined.
 
         Args:
@@ -167,7 +157,7 @@ class Refinement:
         if refined is None or refined.scale_sigma > _NEAR_SCALE_FACTOR * wanted_scale_sigma:
             return refined
         assert solved is not None
-        segment = with_normal_points(
+        segment = normal_points.with_normal_points(
             segment, solved.states, self._landmarks(solved), self._rig, self._options.gate_chi2
         )
         yield _NORMAL_POINTS_UNITS
@@ -177,12 +167,12 @@ class Refinement:
         again = yield from self._solved(round_, solved.states)
         return self._judged(segment, again)
 
-    def _landmarks(self, solved: _Solved) -> Landmarks:
+    def _landmarks(self, solved: _Solved) -> normal_points.Landmarks:
         """Return the landmarks of a round that are not at infinity."""
         tracks = solved.tracks
         rows = tracks.landmark_rows[tracks.h[tracks.landmark_rows, 2] > _LEAST_INVERSE_DEPTH]
         poses = CameraPoses.of(solved.states.T_M_I, self._rig.T_I_C)
-        return Landmarks(tracks.id[rows], tracks.points(rows, poses))
+        return normal_points.Landmarks(tracks.id[rows], tracks.points(rows, poses))
 
     def _with_estimated_noise(self, solved: _Solved) -> Imu:
         """Return the IMU with the noise that the residuals show; as assumed when they cannot tell."""
@@ -191,21 +181,21 @@ class Refinement:
             covariance = solved.problem.covariance_of_frames(linear)
         except NotPositiveDefinite:
             return self._imu
-        factor = noise_factor(solved.chain, solved.states, covariance)
-        return with_least_noise(
+        factor = imu_noise.noise_factor(solved.chain, solved.states, covariance)
+        return imu_noise.with_least_noise(
             self._data_sheet,
             factor * self._imu.gyro_noise_density,
             factor * self._imu.acc_noise_density,
         )
 
-    def _solved(self, round_: _Round, states: WindowStates) -> Work[_Solved | None]:
+    def _solved(self, round_: _Round, states: WindowStates) -> paced_work.Work[_Solved | None]:
         """Triangulate landmarks from states and solve; the result is None without landmarks."""
         segment = round_.segment
         tracks, candidates = self._tracks(segment, round_.observed, states, round_.gate_chi2)
         rows = tracks.landmark_rows
         if not len(rows):
             return None
-        chain = InertialChain(self._inertial, round_.imu)
+        chain = inertial.InertialChain(self._inertial, round_.imu)
         samples = [segment.samples(edge) for edge in range(len(segment) - 1)]
         chain.extend(samples, states.motion[:-1])
         none = np.zeros(len(segment), dtype=np.bool_)
@@ -219,7 +209,7 @@ class Refinement:
         solver = SolverOptions(num_iterations=round_.iterations, function_tolerance=_TOLERANCE)
         yield _TRIANGULATION_UNITS
         steps = optimizing_states(problem, start, solver, SILENT)
-        states, summary = yield from each_step(steps, _UNITS_PER_FRAME * len(segment))
+        states, summary = yield from paced_work.each_step(steps, _UNITS_PER_FRAME * len(segment))
         has_converged = summary.iterations < round_.iterations and len(order) > 0
         tracks.h[rows] = states.h
         rejected = candidates - len(rows)
@@ -301,7 +291,7 @@ class Refinement:
         options = dataclasses.replace(self._options, gate_chi2=gate_chi2)
         cameras = self._calibration.of_kernels(states.calibration)
         at = WindowPoint(states.T_M_I, tracks.h, cameras, np.zeros((0, 7)))
-        Triangulator(self._kernels, options).add_landmarks(
+        triangulation.Triangulator(self._kernels, options).add_landmarks(
             tracks, candidates, at, only_stereo=False
         )
         return tracks, min(len(candidates), options.max_landmarks)

@@ -1,7 +1,5 @@
 """The latest frames before the estimator has started, and some of them to start from."""
 
-from __future__ import annotations
-
 import collections
 import dataclasses
 import itertools

@@ -1,7 +1,5 @@
 """Start at rest: gravity from the accelerometer, the gyroscope's bias from its mean."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 

@@ -5,8 +5,6 @@ knows where it is but for its drift since it last observed the map; answers that
 believed only when they agree for longer, or have many matches.
 """
 
-from __future__ import annotations
-
 import collections
 import dataclasses
 from enum import Enum

@@ -3,8 +3,6 @@
 All see the same answers. VIL changes the odometry, the others read it: T_G_I = T_G_M T_M_I.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Protocol
 

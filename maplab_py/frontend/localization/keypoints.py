@@ -1,7 +1,5 @@
 """Keypoints of a frame that are matched with a map."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 

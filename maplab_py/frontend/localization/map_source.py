@@ -1,7 +1,5 @@
 """The map in which a recording is localised, from a folder or a summary map."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 
@@ -22,10 +20,8 @@ from maplab_py.interop.recordings.protocol import RecordedSensors
 from maplab_py.sensors import CameraRig, SensorSet
 from maplab_py.storage.native import is_map_folder, load_map
 from maplab_py.storage.summary_map import SummaryMap, read_summary_map, summary_map_file
-from maplab_py.vimap import VIMap
-from maplab_py.vimap.descriptors import FeatureType, type_name, types_of
-from maplab_py.vision.features.extractors import KINDS
-from maplab_py.vision.features.options import DESCRIPTORS
+from maplab_py.vimap import VIMap, descriptors
+from maplab_py.vision.features import extractors, options
 
 _FLAG = "--vio_localization_map_folder"
 _SMALLEST_SIGMA_M = 1e-3
@@ -45,7 +41,7 @@ def open_map(
     path: Path,
     *,
     with_covariances: bool = False,
-    feature_type: int = FeatureType.BINARY,
+    feature_type: int = descriptors.FeatureType.BINARY,
     is_free: bool = False,
 ) -> SearchedMap:
     """Read a map folder or a summary map.
@@ -62,9 +58,9 @@ def open_map(
     """
     if is_map_folder(path):
         vi_map, _ = load_map(path)
-        there = types_of(vi_map.frames)
+        there = descriptors.types_of(vi_map.frames)
         if is_free and feature_type not in there:
-            others = (KINDS[name].feature_type for name in DESCRIPTORS)
+            others = (extractors.KINDS[name].feature_type for name in options.DESCRIPTORS)
             feature_type = next((each for each in others if each in there), feature_type)
         return of_map(
             vi_map, str(path), with_covariances=with_covariances, feature_type=feature_type
@@ -79,10 +75,10 @@ def of_map(
     name: str,
     *,
     with_covariances: bool = False,
-    feature_type: int = FeatureType.BINARY,
+    feature_type: int = descriptors.FeatureType.BINARY,
 ) -> SearchedMap:
     """Take a map in memory; see `open_map`."""
-    types = types_of(vi_map.frames)
+    types = descriptors.types_of(vi_map.frames)
     if types and feature_type not in types:
         raise UserError(_wrong_type(name, sorted(types), feature_type))
     try:
@@ -120,12 +116,12 @@ def of_summary(summary: SummaryMap, name: str, *, with_covariances: bool = False
 
 def _wrong_type(name: str, types: list[int], feature_type: int) -> str:
     """Return why a map cannot be searched with descriptors of a type, and the remedy."""
-    wanted = type_name(feature_type)
+    wanted = descriptors.type_name(feature_type)
     remedy = f"choose a map with {wanted} descriptors"
-    for word in DESCRIPTORS:
-        if KINDS[word].feature_type in types:
+    for word in options.DESCRIPTORS:
+        if extractors.KINDS[word].feature_type in types:
             remedy += f", or give --vio_localization_features={word}"
-    there = ", ".join(type_name(kind) for kind in types)
+    there = ", ".join(descriptors.type_name(kind) for kind in types)
     return f"{name}: its descriptors are {there}, those of the recording {wanted}: {remedy}"
 
 

@@ -1,7 +1,5 @@
 """Matches of a frame with a map: by the index, or near the places that a pose predicts."""
 
-from __future__ import annotations
-
 import dataclasses
 from enum import Enum
 

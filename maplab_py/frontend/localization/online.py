@@ -1,7 +1,5 @@
 """Localisation of the odometry, frame by frame: when to match, what to believe, what to report."""
 
-from __future__ import annotations
-
 import collections
 import dataclasses
 import time
@@ -16,13 +14,11 @@ from maplab_py.errors import EstimationError, UserError
 from maplab_py.estimation.window.map_tracks import MapMatches
 from maplab_py.estimation.window.options import WindowOptions
 from maplab_py.estimation.window.smoother import FixedLagSmoother
-from maplab_py.frontend.localization.agreement import AgreementFilter, Verdict
+from maplab_py.frontend.localization import agreement, map_source, track_check
 from maplab_py.frontend.localization.estimators import MapEstimator, MapPose, make_estimator
 from maplab_py.frontend.localization.keypoints import FrameKeypoints, frame_keypoints
-from maplab_py.frontend.localization.map_source import SearchedMap, calibration_notes
 from maplab_py.frontend.localization.matcher import Answer, MapMatcher
 from maplab_py.frontend.localization.options import OnlineLocalizationOptions
-from maplab_py.frontend.localization.track_check import observed_throughout
 from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.geometry import se3
 from maplab_py.interop.recordings.protocol import RecordedSensors
@@ -108,7 +104,7 @@ class OnlineLocalization:
 
     def __init__(
         self,
-        searched: SearchedMap,
+        searched: map_source.SearchedMap,
         device: RecordedSensors,
         options: OnlineLocalizationOptions,
         window: WindowOptions | None = None,
@@ -125,7 +121,7 @@ class OnlineLocalization:
         """
         self.counts = LocalizationCounts()
         self.events: list[MapEvent] = []  # of the last frame
-        self.notes = calibration_notes(searched, device)
+        self.notes = map_source.calibration_notes(searched, device)
         self.problem = ""
         self.options, self.map_name = options, searched.name
         self.map_landmarks = len(searched.database.p_G)
@@ -134,7 +130,9 @@ class OnlineLocalization:
         self.estimator: MapEstimator = make_estimator(
             options.mode, device, options.rule, window or WindowOptions()
         )
-        self._filter = AgreementFilter(options.min_num_estimates, options.max_mean_error_px)
+        self._filter = agreement.AgreementFilter(
+            options.min_num_estimates, options.max_mean_error_px
+        )
         self._poses: collections.OrderedDict[int, _Remembered] = collections.OrderedDict()
         self._mission = -1
         self._next_ns = -(1 << 62)
@@ -193,14 +191,14 @@ class OnlineLocalization:
         verdict = self._filter.judge(
             answer, remembered.T_M_I, T_G_I, self._matcher.p_G, path_m=remembered.path_m
         )
-        if verdict is Verdict.WAIT:
+        if verdict is agreement.Verdict.WAIT:
             self.counts.disagreeing += T_G_I is not None
             if T_G_I is None and answer.T_G_I is not None and len(answer) >= _PROBABLY_RIGHT:
                 self._next_ns = answer.time_ns
             return False
         answers: tuple[Answer, ...] = (answer,)
         start = None
-        if verdict is Verdict.START:
+        if verdict is agreement.Verdict.START:
             answers, start = tuple(self._filter.take()), answer
         event = MapEvent(answer.time_ns, answers, start)
         self.events.append(event)
@@ -323,7 +321,7 @@ class OnlineLocalization:
             return np.ones(len(rows), dtype=np.bool_)
         landmark = answer.landmark[rows]
         matches = MapMatches(answer.track_id[rows], landmark, self._matcher.p_G[landmark])
-        return observed_throughout(
+        return track_check.observed_throughout(
             matches, bases, smoother, self._device.cameras, self._T_I_C,
             sigma_px=self.options.keypoint_sigma_px,
         )  # fmt: skip

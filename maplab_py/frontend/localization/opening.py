@@ -1,9 +1,6 @@
 """Opening of the map that the options name."""
 
-from __future__ import annotations
-
-from maplab_py.frontend.localization.map_source import check_descriptors, open_map
-from maplab_py.frontend.localization.online import OnlineLocalization
+from maplab_py.frontend.localization import map_source, online
 from maplab_py.frontend.localization.options import OnlineLocalizationOptions
 from maplab_py.frontend.odometry_options import OdometryOptions
 from maplab_py.frontend.vertex_keypoints import check_descriptors_exist
@@ -14,7 +11,7 @@ from maplab_py.vision.features.options import DESCRIPTORS
 
 def opened_localization(
     options: OnlineLocalizationOptions, device: RecordedSensors, odometry: OdometryOptions
-) -> OnlineLocalization | None:
+) -> online.OnlineLocalization | None:
     """Read and index the map; None when the options name no map.
 
     Raises:
@@ -24,7 +21,7 @@ def opened_localization(
     if options.map_folder is None:
         return None
     tracked = odometry.tracking.descriptor_type
-    searched = open_map(
+    searched = map_source.open_map(
         options.map_folder,
         with_covariances=options.rule.estimates_landmarks,
         feature_type=KINDS[options.features or tracked].feature_type,
@@ -41,6 +38,6 @@ def opened_localization(
             tracked,
         )
     else:
-        check_descriptors(searched, kind.size, KINDS[features].feature_type)
+        map_source.check_descriptors(searched, kind.size, KINDS[features].feature_type)
     check_descriptors_exist(features)
-    return OnlineLocalization(searched, device, options, odometry.window, features)
+    return online.OnlineLocalization(searched, device, options, odometry.window, features)

@@ -1,7 +1,5 @@
 """Options of localisation while a recording is read, with rovioli's flag names."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,15 +1,12 @@
 """Record of the localisation of all frames of a run, as a report and as a file."""
 
-from __future__ import annotations
-
 from array import array
 from pathlib import Path
 
 import numpy as np
 
 from maplab_py.array_types import F64, I64
-from maplab_py.frontend.localization.online import LocalizedFrame, OnlineLocalization
-from maplab_py.frontend.localization.reports import LocalizationSummary
+from maplab_py.frontend.localization import online, reports
 from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.geometry import se3
 from maplab_py.interop.text_table import format_rows
@@ -32,7 +29,7 @@ class LocalizationRecord:
         self._times_ns = array("q")
         self._rows = array("d")  # rows of 33 numbers
 
-    def add(self, frame: LocalizedFrame, update: OdometryUpdate) -> None:
+    def add(self, frame: online.LocalizedFrame, update: OdometryUpdate) -> None:
         """Take a frame; without a state of the odometry there is nothing to keep."""
         state, pose = update.state, frame.pose
         if state is None:
@@ -71,14 +68,14 @@ class LocalizationRecord:
 
 
 def summarised(
-    localization: OnlineLocalization, first_ns: int, csv_file: Path | None
-) -> LocalizationSummary:
+    localization: online.OnlineLocalization, first_ns: int, csv_file: Path | None
+) -> reports.LocalizationSummary:
     """Return the counts of a run that began at a time."""
     counts = localization.counts
     first_s = None
     if counts.first_localized_ns >= 0:
         first_s = (counts.first_localized_ns - first_ns) * 1e-9
-    return LocalizationSummary(
+    return reports.LocalizationSummary(
         map_name=localization.map_name,
         mode=localization.options.mode,
         map_landmarks=localization.map_landmarks,

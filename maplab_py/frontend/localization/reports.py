@@ -1,7 +1,5 @@
 """Localisation in a map, as part of a report."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,20 +1,17 @@
 """Whether whole tracks observe the landmarks that they were matched with in one frame."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
 
 from maplab_py.array_types import F64, Mask
-from maplab_py.estimation.window.map_terms import MapTerms, contradicted
-from maplab_py.estimation.window.map_tracks import MapMatches, MapTracks
+from maplab_py.estimation.window import map_terms, map_tracks
 from maplab_py.estimation.window.smoother import FixedLagSmoother
 from maplab_py.sensors import Camera
 
 
 def observed_throughout(
-    matches: MapMatches,
+    matches: map_tracks.MapMatches,
     bases: list[F64],
     smoother: FixedLagSmoother,
     cameras: tuple[Camera, ...],
@@ -34,13 +31,13 @@ def observed_throughout(
         T_I_C: Their poses (C, 7).
         sigma_px: Standard deviation of a keypoint.
     """
-    seen, used = MapTracks.of(matches).observations(smoother.tracks, sigma_px)
+    seen, used = map_tracks.MapTracks.of(matches).observations(smoother.tracks, sigma_px)
     options = smoother.options
-    terms = MapTerms(seen, cameras, T_I_C, huber_sigmas=options.huber_sigmas)
+    terms = map_terms.MapTerms(seen, cameras, T_I_C, huber_sigmas=options.huber_sigmas)
     far: list[Mask] = []
     for T_G_M in bases:
         states = dataclasses.replace(smoother.states, T_G_M=T_G_M[None])
-        far.append(contradicted(terms.errors_px(states), seen, options))
+        far.append(map_terms.contradicted(terms.errors_px(states), seen, options))
         if not far[-1].any():
             break
     result: Mask = np.ones(len(matches), dtype=np.bool_)

@@ -1,7 +1,5 @@
 """The cameras of the viewer's pages."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

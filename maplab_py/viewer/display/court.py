@@ -3,8 +3,6 @@
 A page only collects verdicts. The command judge_closures applies them to the map.
 """
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from functools import partial
@@ -20,15 +18,11 @@ from maplab_py.algorithms.loop_closure.listing import near_miss_order
 from maplab_py.algorithms.loop_closure.reports import Verdict
 from maplab_py.array_types import I64
 from maplab_py.errors import MapError
-from maplab_py.viewer.display import panel
-from maplab_py.viewer.display.camera import approach
-from maplab_py.viewer.display.parts import by_user
+from maplab_py.viewer import facts, picking, scene
+from maplab_py.viewer.display import camera, panel, parts
 from maplab_py.viewer.display.selection import Selection
 from maplab_py.viewer.drawing import Drawing
-from maplab_py.viewer.facts import gate_facts
 from maplab_py.viewer.layers.closures import closure_ends
-from maplab_py.viewer.picking import Pick
-from maplab_py.viewer.scene import Entity
 from maplab_py.vimap import VIMap, to_hex, to_hex_list
 
 Colour = tuple[int, int, int]
@@ -69,7 +63,7 @@ class Bench(Protocol):
     def selection(self) -> Selection:
         """Picked entities."""
 
-    def select(self, picked: Pick) -> None:
+    def select(self, picked: picking.Pick) -> None:
         """Mark a thing and show its facts."""
 
 
@@ -98,7 +92,7 @@ class Court:
             self.text = gui.add_html("")
             for label, key, verdict, colour, hint in _BUTTONS:
                 button = gui.add_button(label, color=colour, hint=f"{hint} (key {key})")
-                callback = by_user(lock, partial(self.judge, verdict), say)
+                callback = parts.by_user(lock, partial(self.judge, verdict), say)
                 button.on_click(callback)
                 gui.add_command(f"closure court: {label}", hotkey=key).on_trigger(callback)
 
@@ -133,12 +127,12 @@ class Court:
         drawing = self._bench.drawing
         ends = np.concatenate(closure_ends(drawing, closures.take(np.array([row]))))
         p = drawing.p_vertices[ends]
-        self._bench.select(Pick(Entity.CLOSURE, row, p.mean(axis=0), 0.0))
+        self._bench.select(picking.Pick(scene.Entity.CLOSURE, row, p.mean(axis=0), 0.0))
         self._show_images()
         if event.client is not None:
             distance_m = 1.5 * float(np.linalg.norm(p[1] - p[0])) + 0.4 * drawing.extent.radius_m
             with event.client.atomic():
-                approach(event.client.camera, p.mean(axis=0), distance_m)
+                camera.approach(event.client.camera, p.mean(axis=0), distance_m)
         self._say()
 
     def _show_images(self) -> None:
@@ -162,7 +156,9 @@ class Court:
                 f"<b>{self._place + 1} of {len(self._cases)}: {name[:8]}</b> {escape(refused)}{decided}"
             )
             gates = [
-                fact for fact in gate_facts(self._map, row) if not fact[0].startswith("passed")
+                fact
+                for fact in facts.gate_facts(self._map, row)
+                if not fact[0].startswith("passed")
             ]
             table = panel.fact_table(tuple(gates))
         elif len(self._cases):

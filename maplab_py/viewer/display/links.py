@@ -1,7 +1,5 @@
 """Links that open a view again: map, camera, layers and selection behind the # of the page's address."""
 
-from __future__ import annotations
-
 import dataclasses
 import threading
 import zlib
@@ -15,8 +13,7 @@ import viser
 
 from maplab_py.array_types import F64
 from maplab_py.errors import UserError
-from maplab_py.viewer.display.parts import by_user
-from maplab_py.viewer.display.selection import Selections
+from maplab_py.viewer.display import parts, selection
 from maplab_py.viewer.drawing import Drawing
 from maplab_py.viewer.picking import id_of
 
@@ -94,7 +91,7 @@ class View(Protocol):
     def visible_layers(self) -> set[str]:
         """Names of the layers that are drawn."""
 
-    selections: Selections
+    selections: selection.Selections
 
     def set_layers(self, visible: set[str]) -> set[str]:
         """Show these layers and no others; return those that the map has not."""
@@ -122,7 +119,7 @@ class Links:
             button = server.gui.add_button(
                 "copy link", hint="a link that opens this map with this camera, layers, selection"
             )
-        button.on_click(by_user(lock, lambda event: self.copy(event.client), say))
+        button.on_click(parts.by_user(lock, lambda event: self.copy(event.client), say))
         server.on_client_connect(self.restore)
 
     def copy(self, client: Any) -> None:

@@ -1,7 +1,5 @@
 """The panel beside the scene: checkboxes, legend, facts, slider."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -11,8 +9,7 @@ from typing import Any, Protocol
 import viser
 
 from maplab_py.viewer.colours import HIDDEN, from_hex
-from maplab_py.viewer.display.camera import VIEWS
-from maplab_py.viewer.display.parts import by_user
+from maplab_py.viewer.display import camera, parts
 from maplab_py.viewer.facts import Facts
 from maplab_py.viewer.layers.closures import REFUSED
 from maplab_py.viewer.options import COLOURINGS, VisualizationOptions
@@ -86,7 +83,7 @@ class Panel:
         self._add_view()
 
     def _bind(self, widget: Any, action: Callable[[Any], None]) -> None:
-        widget.on_update(by_user(self._lock, action, self.say))
+        widget.on_update(parts.by_user(self._lock, action, self.say))
 
     def _choose_colouring(self) -> None:
         mission_id = self._mission_of_label.get(self.coloured_mission.value, "")
@@ -128,11 +125,11 @@ class Panel:
     def _add_view(self) -> None:
         self.view = self._gui.add_folder("View", order=5, expand_by_default=False)
         with self.view:
-            self.views = self._gui.add_button_group("look", VIEWS)
+            self.views = self._gui.add_button_group("look", camera.VIEWS)
             self.ground = self._gui.add_checkbox("ground grid", True)
             self.point_scale = self._gui.add_slider("point size", 0.2, 5.0, 0.1, 1.0)
         self.views.on_click(
-            by_user(
+            parts.by_user(
                 self._lock,
                 lambda event: self._actions.look(event.client, event.target.value),
                 self.say,
@@ -234,7 +231,7 @@ class Panel:
                 hint=f"show or hide mission {mission.id}",
             )
             press = partial(lambda m, b, _: toggle(m, b), mission, button)
-            button.on_click(by_user(self._lock, press, self.say))
+            button.on_click(parts.by_user(self._lock, press, self.say))
             self._mission_widgets.append(button)
 
 

@@ -1,7 +1,5 @@
 """Parts of a scene as nodes of viser; only what has changed is sent."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import json

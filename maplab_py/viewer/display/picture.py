@@ -1,7 +1,5 @@
 """A picture of the scene, taken by an open page or by a Chromium without a window."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
@@ -21,9 +19,8 @@ from maplab_py.child_processes import kill, start
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.output_files import write_bytes, write_text
 from maplab_py.viewer.building import Subject
-from maplab_py.viewer.display import panel
+from maplab_py.viewer.display import panel, parts
 from maplab_py.viewer.display.camera import aim, aim_initially, view_of
-from maplab_py.viewer.display.parts import DARK_GROUND, LIGHT_GROUND, add_part
 from maplab_py.viewer.display.server import page_script, page_style
 from maplab_py.viewer.drawing import Drawing
 from maplab_py.viewer.history import MAX_STATES, error_curves, history_chart, state_layers
@@ -137,7 +134,7 @@ def on_ground(picture: U8, *, is_dark: bool) -> U8:
     """Lay a picture with transparency (H, W, 4) on the theme's ground; return (H, W, 3)."""
     if picture.shape[2] == 3:
         return picture
-    ground = np.array(DARK_GROUND if is_dark else LIGHT_GROUND, dtype=np.float64)
+    ground = np.array(parts.DARK_GROUND if is_dark else parts.LIGHT_GROUND, dtype=np.float64)
     part = picture[:, :, 3:].astype(np.float64) / 255.0
     mixed = part * picture[:, :, :3] + (1.0 - part) * ground
     return np.asarray(np.round(mixed), dtype=np.uint8)
@@ -231,7 +228,7 @@ def states_to_choose(server: Any, drawing: Drawing, subject: Subject | None) -> 
         layers = () if number == place else state_layers(drawing, state, len(states))
         for layer in layers:
             for mission, part in layer.parts.items():
-                handles += add_part(server, f"/history/{number}/{layer.name}/{mission}", part)
+                handles += parts.add_part(server, f"/history/{number}/{layer.name}/{mission}", part)
     for handle in handles:
         handle.visible = False
     charts = "".join(

@@ -1,7 +1,5 @@
 """Playback: the steps of the time line, what the scene and the plots show at each, and the tick."""
 
-from __future__ import annotations
-
 import base64
 import logging
 import threading
@@ -17,9 +15,8 @@ import viser
 from maplab_py.array_types import F64, I64, U8
 from maplab_py.viewer.building import Subject
 from maplab_py.viewer.colours import AXES, hex_codes
-from maplab_py.viewer.display import panel
+from maplab_py.viewer.display import panel, parts
 from maplab_py.viewer.display.camera import FREE, RIDES, ride
-from maplab_py.viewer.display.parts import by_user
 from maplab_py.viewer.display.player import Player
 from maplab_py.viewer.drawing import Drawing
 from maplab_py.viewer.options import PlaybackOptions
@@ -371,8 +368,8 @@ class TimeLine:
             (self.ride, lambda event: playing.set_ride(event.target.value)),
             (self.mission, lambda event: playing.choose_mission(event.target.value)),
         ):
-            widget.on_update(by_user(lock, action, say))
-        toggle = by_user(lock, lambda _: playing.set_playing(not self.is_playing), say)
+            widget.on_update(parts.by_user(lock, action, say))
+        toggle = parts.by_user(lock, lambda _: playing.set_playing(not self.is_playing), say)
         self.play.on_click(toggle)
         server.gui.add_command("play or pause the missions", hotkey="space").on_trigger(toggle)
 

@@ -4,8 +4,6 @@ Each step adds a separate node, made once; moving the slider shows and hides nod
 which costs a few bytes per step however large the map is.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -13,14 +11,12 @@ import viser
 
 from maplab_py.array_types import I64
 from maplab_py.geometry import se3
-from maplab_py.viewer import colours
+from maplab_py.viewer import colours, playback
 from maplab_py.viewer.display.parts import add_part
 from maplab_py.viewer.drawing import Drawing, make_points, make_segments, spread_rows
-from maplab_py.viewer.layers.cameras import frustum_points, mission_cameras
+from maplab_py.viewer.layers import cameras, landmarks
 from maplab_py.viewer.layers.clouds import Cloud, cloud_colours, colour_ranges
-from maplab_py.viewer.layers.landmarks import landmark_colours, point_size
 from maplab_py.viewer.options import PlaybackOptions
-from maplab_py.viewer.playback import Timeline, make_timeline
 
 _FRUSTUM = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
 
@@ -48,7 +44,7 @@ class Player:
         self._server = server
         self._drawing = drawing
         self._fades = options.landmark_fadeout
-        self.timeline: Timeline = make_timeline(drawing, options)
+        self.timeline: playback.Timeline = playback.make_timeline(drawing, options)
         self._plays = np.array([m in missions for m in drawing.mission_ids], dtype=np.bool_)
         self._recent: list[Any] = []
         self.step = -1
@@ -108,7 +104,7 @@ class Player:
         paths = _group(timeline.vertex_step[start + 1], start)
         rows = timeline.landmarks[self._plays[drawing.landmark_mission[timeline.landmarks]]]
         clouds = _group(timeline.landmark_step[rows], rows)
-        every, _ = landmark_colours(drawing)
+        every, _ = landmarks.landmark_colours(drawing)
         chunks: dict[int, list[Any]] = {}
         p = drawing.p_vertices
         for step, members in paths.items():
@@ -122,7 +118,7 @@ class Player:
             chunks.setdefault(step, []).extend(add_part(self._server, f"/play/{step}/path", path))
         for step, members in clouds.items():
             cloud = make_points(
-                drawing.p_landmarks[members], every[members], members, point_size(drawing)
+                drawing.p_landmarks[members], every[members], members, landmarks.point_size(drawing)
             )
             chunks.setdefault(step, []).extend(
                 add_part(self._server, f"/play/{step}/landmarks", cloud)
@@ -156,10 +152,10 @@ class Player:
             colour = drawing.mission_colours[mission]
             name = f"/play/head/{drawing.mission_ids[mission]}"
             lines = [
-                se3.transform(camera.T_I_C, frustum_points(camera.camera, 0.06 * drawing.unit_m))[
-                    _FRUSTUM
-                ]
-                for camera in mission_cameras(drawing.vi_map, mission)
+                se3.transform(
+                    camera.T_I_C, cameras.frustum_points(camera.camera, 0.06 * drawing.unit_m)
+                )[_FRUSTUM]
+                for camera in cameras.mission_cameras(drawing.vi_map, mission)
             ]
             if lines:
                 ends = np.concatenate(lines)
@@ -192,7 +188,7 @@ class Player:
             self._drawing.p_landmarks[rows],
             glow.astype(np.uint8),
             rows,
-            1.6 * point_size(self._drawing),
+            1.6 * landmarks.point_size(self._drawing),
         )
         self._recent = add_part(self._server, "/play/recent", part)
 

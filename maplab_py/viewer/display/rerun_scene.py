@@ -4,8 +4,6 @@ Needs the library rerun-sdk (the extra `rerun`). Layers are those that the brows
 poses and images have the times of their vertices.
 """
 
-from __future__ import annotations
-
 import functools
 import importlib.util
 import tempfile

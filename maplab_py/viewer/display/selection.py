@@ -1,7 +1,5 @@
 """Selected entities of each page: their facts, frusta and rays, and the distance between two picks."""
 
-from __future__ import annotations
-
 import dataclasses
 import threading
 from collections.abc import Callable
@@ -16,19 +14,15 @@ from maplab_py.algorithms.landmarks.sightings import residuals
 from maplab_py.algorithms.loop_closure.closure_record import read_record
 from maplab_py.array_types import F64, I64, U8
 from maplab_py.errors import MapError, UserError
-from maplab_py.viewer import colours
-from maplab_py.viewer.display import panel
+from maplab_py.viewer import colours, resource_clouds
+from maplab_py.viewer.display import panel, parts
 from maplab_py.viewer.display.camera import approach
-from maplab_py.viewer.display.parts import add_part, by_user
 from maplab_py.viewer.drawing import Drawing, make_points, make_segments
 from maplab_py.viewer.facts import Facts, facts
-from maplab_py.viewer.layers import cameras
-from maplab_py.viewer.layers.closures import closure_ends
+from maplab_py.viewer.layers import cameras, closures
 from maplab_py.viewer.picking import MIN_DIGITS, Pick, find_by_id, id_of
-from maplab_py.viewer.resource_clouds import VertexImages
 from maplab_py.viewer.scene import Entity, Part
-from maplab_py.vimap import VIMap, ragged_rows
-from maplab_py.vimap.descriptors import binary_descriptor_sizes
+from maplab_py.vimap import VIMap, descriptors, ragged_rows
 
 _HINT = "Click a vertex, a landmark or a loop closure."
 _MAX_FRUSTA = 16
@@ -50,9 +44,9 @@ def _content(drawing: Drawing, picked: Pick) -> _Content:
     image, note = None, ""
     if picked.entity is Entity.VERTEX:
         image = images(picked.row)
-        if image is not None and isinstance(images, VertexImages):
+        if image is not None and isinstance(images, resource_clouds.VertexImages):
             image, note = with_keypoints(vi_map, image, images.frame(picked.row))
-    elif ends and isinstance(images, VertexImages):
+    elif ends and isinstance(images, resource_clouds.VertexImages):
         image, note = closure_picture(vi_map, images, *ends) or (None, "")
     return _Content(facts(vi_map, picked.entity, picked.row), image, note, ends)
 
@@ -63,7 +57,7 @@ def _closure_ends(drawing: Drawing, picked: Pick) -> tuple[int, ...]:
         return int(edges.from_vertex[picked.row]), int(edges.to_vertex[picked.row])
     if picked.entity is Entity.CLOSURE:
         closure = read_record(drawing.vi_map).closures.take(np.array([picked.row]))
-        return tuple(np.concatenate(closure_ends(drawing, closure)).tolist())
+        return tuple(np.concatenate(closures.closure_ends(drawing, closure)).tolist())
     return ()
 
 
@@ -209,7 +203,7 @@ class Selection:
         self._handles.append(label)
 
     def _add(self, name: str, part: Part) -> None:
-        self._handles += add_part(self._page, f"/pick/{name}", part)
+        self._handles += parts.add_part(self._page, f"/pick/{name}", part)
 
 
 class Selections:
@@ -317,8 +311,8 @@ class Selections:
             self.of(page).is_measuring = event.target.value
 
         for widget, action in ((widgets.jump, self._go), (widgets.measuring, measure)):
-            widget.on_update(by_user(self._lock, action, self._say))
-        clear = by_user(self._lock, lambda _: self.of(page).clear(), self._say)
+            widget.on_update(parts.by_user(self._lock, action, self._say))
+        clear = parts.by_user(self._lock, lambda _: self.of(page).clear(), self._say)
         widgets.clear.on_click(clear)
         return widgets
 
@@ -405,7 +399,7 @@ class Matches:
 
 
 def closure_picture(
-    vi_map: VIMap, images: VertexImages, query: int, place: int
+    vi_map: VIMap, images: resource_clouds.VertexImages, query: int, place: int
 ) -> tuple[U8, str] | None:
     """Return a picture (H, W, 3) RGB of two vertices (rows) with their matches, and what it shows.
 
@@ -447,7 +441,7 @@ def matches_of_frames(vi_map: VIMap, first: int, second: int) -> Matches:
     _, rows_a, rows_b = np.intersect1d(landmark[a_seen], landmark[b_seen], return_indices=True)
     if len(rows_a):
         return Matches(a_seen[rows_a], b_seen[rows_b], are_landmarks=True)
-    sizes = binary_descriptor_sizes(vi_map.frames)
+    sizes = descriptors.binary_descriptor_sizes(vi_map.frames)
     size = int(sizes[a].max(initial=0))
     a, b = a[sizes[a] == size], b[sizes[b] == size]
     if not size or not len(a) or not len(b):

@@ -1,7 +1,5 @@
 """The viser server."""
 
-from __future__ import annotations
-
 import asyncio
 import functools
 import gzip

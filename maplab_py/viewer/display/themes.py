@@ -1,7 +1,5 @@
 """Light and dark pages: each follows its system until its user chooses."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from typing import Any

@@ -1,16 +1,13 @@
 """The undo history of the map as a slider in the panel, with the errors of its states."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from typing import Any
 
 import viser
 
-from maplab_py.viewer.building import Subject
+from maplab_py.viewer import building, history
 from maplab_py.viewer.display.parts import by_user
-from maplab_py.viewer.history import Curve, error_curves, history_chart
 
 
 class TimeMachine:
@@ -45,16 +42,16 @@ class TimeMachine:
         self.swipe.on_update(show)
         self.slider.on_update(show)
         self._is_stopped = False
-        self._subject: Subject | None = None
-        self._curves: tuple[Curve, ...] = ()
-        self._measured: Subject | None = None  # that the curves belong to
+        self._subject: building.Subject | None = None
+        self._curves: tuple[history.Curve, ...] = ()
+        self._measured: building.Subject | None = None  # that the curves belong to
 
     @property
     def swipes(self) -> bool:
         """Tell whether states are shown left of a swipe line."""
         return bool(self.swipe.value)
 
-    def show(self, subject: Subject) -> None:
+    def show(self, subject: building.Subject) -> None:
         """Show the history of a subject, with the curves that are known of it."""
         self._subject = subject
         states = subject.history
@@ -73,7 +70,7 @@ class TimeMachine:
         if int(self.slider.value) != place:
             self.slider.value = place
         is_known = self._measured is not None and self._measured.history is states
-        self.chart.content = history_chart(states, self._curves if is_known else (), place)
+        self.chart.content = history.history_chart(states, self._curves if is_known else (), place)
 
     def stop(self) -> None:
         """Change nothing any more: the server is about to stop."""
@@ -86,7 +83,7 @@ class TimeMachine:
             return
         if self._measured is not None and self._measured.history is subject.history:
             return
-        curves = error_curves(subject.history, subject.truth)
+        curves = history.error_curves(subject.history, subject.truth)
         with self._lock:
             if self._is_stopped:
                 return

@@ -5,8 +5,6 @@ the viewer's own that builds scenes, so that no command waits for a picture. All
 under one lock; maps are values, so what is being drawn cannot change underneath.
 """
 
-from __future__ import annotations
-
 import atexit
 import dataclasses
 import logging
@@ -17,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from maplab_py.errors import MaplabError, UserError
+from maplab_py.viewer import ground, picking
 from maplab_py.viewer.building import Subject, make_checked_drawing, scene_of
 from maplab_py.viewer.display.camera import Cameras, aim
 from maplab_py.viewer.display.court import Court
@@ -36,10 +35,8 @@ from maplab_py.viewer.display.server import LOOPBACK, start_server
 from maplab_py.viewer.display.themes import Themes
 from maplab_py.viewer.display.time_machine import TimeMachine
 from maplab_py.viewer.drawing import Drawing
-from maplab_py.viewer.ground import make_ground
 from maplab_py.viewer.layers.closures import REFUSED
 from maplab_py.viewer.options import PlaybackOptions
-from maplab_py.viewer.picking import Pick, pick
 from maplab_py.viewer.playback import moved_scene, without_played
 from maplab_py.viewer.scene import Scene
 from maplab_py.vimap import VIMap
@@ -401,7 +398,7 @@ class Viewer:
         """Forget what was picked in any page."""
         self.selections.clear()
 
-    def select(self, picked: Pick) -> None:
+    def select(self, picked: picking.Pick) -> None:
         """Mark a thing and show its facts in all pages, as if it had been clicked in each."""
         with self._lock:
             self.selections.pick(self.drawing, picked)
@@ -423,7 +420,7 @@ class Viewer:
     def _click(self, event: Any) -> None:
         if self.scene is None:
             return
-        picked = pick(
+        picked = picking.pick(
             self.scene, event.ray_origin, event.ray_direction,
             layers=self.visible_layers, missions=self.visible_missions,
         )  # fmt: skip
@@ -475,7 +472,7 @@ class Viewer:
             self.selections.clear()
         self._playback.stop()
         if is_new_place:
-            self._nodes.show_ground(make_ground(scene.extent, scene.origin_G))
+            self._nodes.show_ground(ground.make_ground(scene.extent, scene.origin_G))
         if is_other_map:
             self._cameras.show_all(scene.extent)
         else:

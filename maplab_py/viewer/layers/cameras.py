@@ -1,7 +1,5 @@
 """Camera frusta, rays of observations, and the mounting of sensors."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -9,8 +7,7 @@ import numpy as np
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3
-from maplab_py.sensors import Camera, CameraRig, SensorSet
-from maplab_py.sensors.projection import back_project
+from maplab_py.sensors import Camera, CameraRig, SensorSet, projection
 from maplab_py.viewer import colours
 from maplab_py.viewer.drawing import Drawing, make_segments, omission_notes
 from maplab_py.viewer.scene import Axes, Layer, Part
@@ -53,7 +50,7 @@ def frustum_points(camera: Camera, depth_m: float) -> F64:
     rays = np.zeros((4, 3))
     for inset in (0.0, 0.05, 0.1, 0.2, 0.3, 0.4):
         uv = corners + inset * (0.5 * size - corners) * 2.0
-        rays, valid = back_project(camera, uv)
+        rays, valid = projection.back_project(camera, uv)
         if valid.all() and (rays[:, 2] > 0.05).all():
             break
     reach = rays / np.maximum(rays[:, 2:], 0.2)

@@ -1,7 +1,5 @@
 """Regions that changed between sessions, and the images before and after side by side."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 

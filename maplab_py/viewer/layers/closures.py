@@ -1,7 +1,5 @@
 """Recorded loop closures, accepted and refused."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.algorithms.loop_closure.closure_record import ClosureRecord, read_record

@@ -1,7 +1,5 @@
 """Dense clouds and meshes as layers."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

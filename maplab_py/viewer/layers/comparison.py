@@ -1,7 +1,5 @@
 """Another map, or another state of the map, beside the map: one camera looks at both."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

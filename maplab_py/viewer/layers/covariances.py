@@ -1,7 +1,5 @@
 """Covariances of positions as ellipsoids: three principal ellipses each."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.array_types import F64, I64, U8

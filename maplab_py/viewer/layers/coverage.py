@@ -1,13 +1,10 @@
 """Tubes of uncertainty along the path, fog over poorly seen volume, and places to walk to next."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
 
-from maplab_py.algorithms.vi_optimization.map_problem import build
-from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
+from maplab_py.algorithms.vi_optimization import map_problem, options
 from maplab_py.array_types import F64, I64, Mask, NDArray
 from maplab_py.errors import MaplabError
 from maplab_py.estimation.problem.marginals import Marginals
@@ -87,7 +84,7 @@ def position_covariances(drawing: Drawing) -> F64:
         MaplabError: The measurements do not determine the path.
     """
     vi_map = drawing.vi_map
-    problem = build(vi_map, VIOptimizationOptions())
+    problem = map_problem.build(vi_map, options.VIOptimizationOptions())
     marginals = Marginals(problem.problem, problem.states)
     start = vi_map.vertex_start
     covariance = np.zeros((len(vi_map.vertices), 3, 3))

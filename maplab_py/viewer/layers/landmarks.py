@@ -1,7 +1,5 @@
 """Landmarks: which are drawn, and in which colour."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

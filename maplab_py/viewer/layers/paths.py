@@ -1,7 +1,5 @@
 """Trajectories, vertices, and the edges between them."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """References to compare the map with: another state, ground truth; and marked segments."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import io
@@ -13,8 +11,7 @@ from maplab_py.algorithms.evaluation.options import TrajectoryEvaluationOptions
 from maplab_py.algorithms.evaluation.trajectory_evaluation import match
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import EstimationError, MapError, UserError
-from maplab_py.geometry import se3
-from maplab_py.geometry.alignment import align_yaw_position
+from maplab_py.geometry import alignment, se3
 from maplab_py.input_files import SCRIPT_MAX_BYTES, read_text
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.viewer import colours
@@ -89,7 +86,7 @@ def _aligned_truth(stamps_ns: I64, p: F64, truth: Trajectory) -> tuple[I64, F64,
             "(do the clocks agree?)"
         )
     try:
-        T_scene_R = align_yaw_position(p[rows], T_R_B[rows, 4:])
+        T_scene_R = alignment.align_yaw_position(p[rows], T_R_B[rows, 4:])
     except EstimationError as error:
         raise UserError(f"{truth.source}: {error}") from None
     return rows, se3.transform(T_scene_R, T_R_B[rows, 4:]), T_scene_R
