@@ -4,8 +4,6 @@ Imports inside functions count. Imports for type checkers alone (`if TYPE_CHECKI
 let two classes name each other in annotations.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from graphlib import CycleError, TopologicalSorter
 

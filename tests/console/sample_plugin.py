@@ -1,7 +1,5 @@
 """A plugin as a stranger would write it, and small maps, for tests of the console."""
 
-from __future__ import annotations
-
 import dataclasses
 import sys
 from enum import Enum

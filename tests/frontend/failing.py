@@ -1,7 +1,5 @@
 """Recordings of which a sensor fails at a time."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterator
 

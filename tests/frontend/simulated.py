@@ -1,7 +1,5 @@
 """Simulated missions that odometry replays, and their truth."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from collections.abc import Iterator

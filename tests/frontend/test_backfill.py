@@ -1,7 +1,5 @@
 """Frames before the start: their states are found afterwards, and become vertices of the map."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

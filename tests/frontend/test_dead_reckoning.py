@@ -1,7 +1,5 @@
 """The tie between two missions: true, and as sure as it says."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

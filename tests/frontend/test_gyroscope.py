@@ -1,7 +1,5 @@
 """The turn between frames."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Samples cut and interpolated at the times of frames."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Maps built from states, keypoints and samples: a replayed mission is rebuilt as it was."""
 
-from __future__ import annotations
-
 import dataclasses
 from concurrent.futures import Future
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Runs over recordings: what is made of them, also when they end early."""
 
-from __future__ import annotations
-
 import dataclasses
 import gc
 import time

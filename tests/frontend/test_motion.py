@@ -1,7 +1,5 @@
 """Standing still, turning and moving are told apart."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

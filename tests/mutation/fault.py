@@ -1,7 +1,5 @@
 """What a planted fault is."""
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A copy of the tree in which faults are planted one after the other."""
 
-from __future__ import annotations
-
 import os
 import resource
 import shutil

@@ -3,8 +3,6 @@
 `dying SOCKET MODULE.FUNCTION before|after`, as `child_processes.Service` starts it.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

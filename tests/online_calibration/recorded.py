@@ -1,7 +1,5 @@
 """Segments of simulated sessions as they leave the window of an odometry."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 

@@ -1,7 +1,5 @@
 """A run that hands its segments on."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The process beside an odometry: segments, database, contradictions, proposals; also when it is killed."""
 
-from __future__ import annotations
-
 import signal
 import threading
 from pathlib import Path

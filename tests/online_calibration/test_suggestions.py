@@ -1,7 +1,5 @@
 """Suggested motions teach more than others."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

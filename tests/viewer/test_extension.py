@@ -1,7 +1,5 @@
 """Layers that plugins add: drawn where the map is drawn, and never fatal."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

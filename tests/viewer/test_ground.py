@@ -1,7 +1,5 @@
 """Grid, scale bar, labels of ends, colours of missions."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """The states of a map's history: their errors, and what is drawn of each."""
 
-from __future__ import annotations
-
 import io
 from contextlib import nullcontext
 from pathlib import Path

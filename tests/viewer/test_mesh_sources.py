@@ -1,7 +1,5 @@
 """Colours of meshes by every rule, slices of distance fields, files of meshes."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 

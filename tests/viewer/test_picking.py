@@ -1,7 +1,5 @@
 """A click or an id leads to what it names; playing a mission; level of detail."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

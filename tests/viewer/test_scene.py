@@ -1,7 +1,5 @@
 """Every layer holds what the map holds, where the map has it."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

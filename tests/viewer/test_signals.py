@@ -1,7 +1,5 @@
 """What is plotted along a mission, and both images of a closure."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

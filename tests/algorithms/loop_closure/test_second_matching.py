@@ -1,7 +1,5 @@
 """Candidates with too few inliers are matched again by a network, here one that knows the answer."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

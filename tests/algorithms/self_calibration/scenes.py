@@ -1,7 +1,5 @@
 """Maps for these tests: exact or noisy, with a device that is not what its calibration says."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import cache
 

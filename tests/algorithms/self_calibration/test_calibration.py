@@ -1,7 +1,5 @@
 """The calibration against truth; what is refused or doubted, and motions that excite too little."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

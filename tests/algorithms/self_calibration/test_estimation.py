@@ -1,7 +1,5 @@
 """Corrected IMU samples, tracks that jump, and parts that lose their lengths while solving."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Segments and information, and their database: sessions, capacity, file, outdated segments."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import os

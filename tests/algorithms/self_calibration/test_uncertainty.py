@@ -1,7 +1,5 @@
 """Deviations where tracks drift, and single segments: tested, scored, ranked and bridged."""
 
-from __future__ import annotations
-
 import dataclasses
 from functools import cache
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Typed text split into commands, and plugins that are found, broken, clashing or restricted."""
 
-from __future__ import annotations
-
 import ast
 import itertools
 import shlex

@@ -1,7 +1,5 @@
 """What the console proposes, how it colours a line, and how soon."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

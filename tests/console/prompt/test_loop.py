@@ -1,7 +1,5 @@
 """The prompt: its first lines, its history file, and the loop around it."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

@@ -1,7 +1,5 @@
 """The screens of all commands: the example of each, in the folder of `tests.registry.workspace`."""
 
-from __future__ import annotations
-
 import os
 import shutil
 from contextlib import chdir

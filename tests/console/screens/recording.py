@@ -1,7 +1,5 @@
 """What a command shows, drawn for several widths, without what differs between machines."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Screens without what differs between machines: times, sizes of files, folders, estimates."""
 
-from __future__ import annotations
-
 import os
 import re
 from pathlib import Path

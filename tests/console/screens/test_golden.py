@@ -3,8 +3,6 @@
 `python -m tests.console.screens [COMMAND ...]` writes them again after a wanted change.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

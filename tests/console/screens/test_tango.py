@@ -1,7 +1,5 @@
 """Reports on a recorded map at 80 columns: whole words, rows under every head, one table per thing."""
 
-from __future__ import annotations
-
 import re
 import textwrap
 import time

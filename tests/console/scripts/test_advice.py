@@ -1,7 +1,5 @@
 """Advice, remedies that `fix` and `--auto_fix` run, and help."""
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Nonsense typed at the console: one line of answer, never a traceback, never a changed map."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Scripts and batch files: status, output, folders with any name."""
 
-from __future__ import annotations
-
 import io
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a line can be besides a command, and chains that are not started for a fault."""
 
-from __future__ import annotations
-
 import json
 import re
 import time

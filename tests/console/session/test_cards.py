@@ -1,7 +1,5 @@
 """Cards of saved maps, and maps that are made again by them."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any

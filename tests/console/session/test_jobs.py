@@ -1,7 +1,5 @@
 """Commands in the background: one consistent value of the map, results that find their way."""
 
-from __future__ import annotations
-
 import threading
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Maps of a session: names, history and its memory, provenance."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

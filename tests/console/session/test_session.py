@@ -1,7 +1,5 @@
 """Sessions, their settings, and those that watch them."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable
 from pathlib import Path

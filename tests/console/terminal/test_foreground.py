@@ -1,7 +1,5 @@
 """The terminal while a command runs: foreground, pager, progress, questions."""
 
-from __future__ import annotations
-
 import io
 import os
 import signal

@@ -1,7 +1,5 @@
 """Reports as text: columns that fit, layout, numbers."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 

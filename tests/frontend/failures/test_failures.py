@@ -1,7 +1,5 @@
 """Sensors that fail are found and left out; whole ones are not."""
 
-from __future__ import annotations
-
 import dataclasses
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """Flights with known truth, as frames of tracked keypoints and IMU samples."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

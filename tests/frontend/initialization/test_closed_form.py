@@ -1,7 +1,5 @@
 """Gyroscope bias from epipolar geometry, and the closed form for velocity, gravity and bias."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Figures of noise that the samples contradict."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """When the estimator starts, how well, and why it does not."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

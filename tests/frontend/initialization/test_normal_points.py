@@ -1,7 +1,5 @@
 """Observations are averaged with those of neighbouring frames, and stay where they belong."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Work that is done in parts."""
 
-from __future__ import annotations
-
 from collections.abc import Generator
 
 from maplab_py.frontend.initialization.paced_work import PacedWork, Work, each_step, finished

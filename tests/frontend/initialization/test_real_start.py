@@ -1,7 +1,5 @@
 """The start on EuRoC MH_01, which is in motion from its first image, and on a handheld Tango."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

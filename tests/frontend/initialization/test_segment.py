@@ -1,7 +1,5 @@
 """The latest frames: joined samples, gaps, and what is kept."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from maplab_py.estimation.window.frame import WindowFrame

@@ -1,7 +1,5 @@
 """A map whose poses are true, and a session in it that odometry replays, with its truth."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 

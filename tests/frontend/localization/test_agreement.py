@@ -1,7 +1,5 @@
 """When T_G_M is set and set again, and what happens to late answers."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Maps whose descriptors are not those of recordings."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

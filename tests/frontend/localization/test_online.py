@@ -1,7 +1,5 @@
 """Localisation while a recording is replayed: all modes, wrong maps, wrong answers, late answers."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

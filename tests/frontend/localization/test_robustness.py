@@ -1,7 +1,5 @@
 """False matches, an outage, rest and turning on the spot."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

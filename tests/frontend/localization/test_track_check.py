@@ -1,7 +1,5 @@
 """A track is matched with a landmark in one frame, and must have observed it in the others, too."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The faults by area, as data."""
 
-from __future__ import annotations
-
 from tests.mutation.fault import Fault
 from tests.mutation.faults.algorithms import ALGORITHMS
 from tests.mutation.faults.console import CONSOLE

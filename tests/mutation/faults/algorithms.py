@@ -1,7 +1,5 @@
 """Faults of the estimator, anchoring, relaxation, sparsification, keyframing and the viewer."""
 
-from __future__ import annotations
-
 from tests.mutation.fault import Fault
 
 _ESTIMATION = (

@@ -1,7 +1,5 @@
 """Faults of the console: lines, flags, maps, jobs, statuses."""
 
-from __future__ import annotations
-
 from tests.mutation.fault import Fault
 
 _SETTINGS = ("tests/console/session/test_session.py",)

@@ -1,7 +1,5 @@
 """Faults of loop closure: gates, consensus, merging, edges."""
 
-from __future__ import annotations
-
 from tests.mutation.fault import Fault
 
 _GATES = ("tests/algorithms/loop_closure/test_gates.py",)

@@ -1,7 +1,5 @@
 """Faults of self-calibration: segments, their scores and tests, export."""
 
-from __future__ import annotations
-
 from tests.mutation.fault import Fault
 
 _SINGLE = ("tests/algorithms/self_calibration/test_uncertainty.py",)

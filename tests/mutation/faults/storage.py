@@ -1,7 +1,5 @@
 """Faults of reading and saving maps, and of writing other files."""
 
-from __future__ import annotations
-
 from tests.mutation.fault import Fault
 
 _MAPS = ("tests/storage",)

@@ -1,7 +1,5 @@
 """A real browser for tests: Chromium by playwright, rendering in software."""
 
-from __future__ import annotations
-
 import importlib
 import time
 from collections.abc import Iterator

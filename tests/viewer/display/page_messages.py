@@ -1,7 +1,5 @@
 """What the viewer sends to an open page, read from a connection as a browser reads it."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Meshes by every rule, a slice of distances, and the depth of a picked vertex in a real browser."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What the viewer leaves behind, and what browsers may do to it, each test with a viewer of its own."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import signal

@@ -1,7 +1,5 @@
 """Cameras of pages: a map that grows stays in the picture, unless somebody has moved the camera."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Links to a view: what they hold, and what a page that is opened by one shows."""
 
-from __future__ import annotations
-
 import contextlib
 import urllib.error
 import urllib.request

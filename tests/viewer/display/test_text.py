@@ -1,7 +1,5 @@
 """The panel's texts, plots of the time line, files of Rerun."""
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import importlib.util

@@ -1,7 +1,5 @@
 """The viewer without a browser: what it serves, refuses, follows, and leaves alone."""
 
-from __future__ import annotations
-
 import contextlib
 import gzip
 import socket

@@ -1,7 +1,5 @@
 """Layers of closures, clouds, compared maps and covariances."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """BRISK descriptors of given keypoints."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Detection: strong corners, spread over the grid, where they may be."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Features of OpenCV on recorded images: how many agree between neighbours."""
 
-from __future__ import annotations
-
 import itertools
 
 import cv2

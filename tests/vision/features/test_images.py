@@ -1,7 +1,5 @@
 """Preparation of images: size, contrast, masks, and what is refused."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Checkpoints that are read as arrays, networks made of them, and files that are refused."""
 
-from __future__ import annotations
-
 import builtins
 import io
 import os

@@ -1,7 +1,5 @@
 """The graph of LighterGlue against a plain computation with the same weights, and its matches."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The graph of XFeat against a plain computation with the same weights, and its features."""
 
-from __future__ import annotations
-
 from concurrent.futures import Future
 from typing import Any
 
