@@ -104,7 +104,9 @@ class ThereAndBack:
                 if item.time_ns - self.start_ns > self._duration_ns:
                     return
                 if isinstance(item, ImuBatch):
-                    new = item[int(np.searchsorted(item.times_ns, last_ns, side="right")) :]
+                    new = item.take(
+                        slice(int(np.searchsorted(item.times_ns, last_ns, side="right")), None)
+                    )
                     if len(new):
                         last_ns = int(new.times_ns[-1])
                         yield new

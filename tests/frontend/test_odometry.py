@@ -130,7 +130,7 @@ def test_batches_of_samples_do_not_change_results() -> None:
     split: list[Event] = []
     for event in events:
         if isinstance(event, ImuBatch):
-            split += [event[row : row + 1] for row in range(len(event))]
+            split += [event.take(slice(row, row + 1)) for row in range(len(event))]
         else:
             split.append(event)
     late: list[Event] = [event for event in events if isinstance(event, TrackedFrameSet)]
