@@ -80,7 +80,7 @@ def _entropies(axes: Figure, data: list[DataSet]) -> None:
         unit = levels(each.names)
         for segment in each.evaluation.segments:
             _, log_determinant = np.linalg.slogdet(segment.covariance / np.outer(unit, unit))
-            values.append(0.5 * (len(unit) * np.log(2.0 * np.pi * np.e) + log_determinant))
+            values.append(0.5 * (len(unit) * (np.log(2.0 * np.pi) + 1.0) + log_determinant))
     axes.hist(values, bins=30)
     _title(axes, "6.5", f"{len(values)} segments", "normalised entropy", "segments")
 
