@@ -212,6 +212,7 @@ def plot_paths(signal: Signal, vertices: I64, progress: F64) -> tuple[str, ...]:
     Args:
         signal: What to plot.
         vertices: Rows (N,) of one mission, in order.
+        progress: Where (N,) each of them is along the time line, in [0, 1].
     """
     values = signal.values[vertices]
     low, high = _range(values)
