@@ -101,9 +101,10 @@ def search(
     is_near: Mask | None = None,
 ) -> tuple[F64, Mask]:
     """Find keypoints as `follow` does, without the way back, with a turn (2, 2) of the image."""
-    levels = np.full(len(uv), len(first.levels) - 1)
+    coarsest = min(len(first.levels), len(second.levels)) - 1  # cameras of a rig may differ in size
+    levels = np.full(len(uv), coarsest)
     if is_near is not None:
-        levels[is_near] = min(_LEVELS_OF_NEAR, len(first.levels) - 1)
+        levels[is_near] = min(_LEVELS_OF_NEAR, coarsest)
     there, is_tracked = _flow(first, second, uv, predicted_uv, options, levels, turn)
     height, width = second.image.shape
     inside = np.all((there >= 0.0) & (there <= np.array([width - 1, height - 1])), axis=1)

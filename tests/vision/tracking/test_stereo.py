@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import cv2
 import numpy as np
 
 from maplab_py.array_types import F64
@@ -10,7 +11,16 @@ from maplab_py.vision.features.options import FeatureOptions
 from maplab_py.vision.tracking.tracker import FrameTracker
 from maplab_py.vision.tracking.tracks import TrackedImages
 from maplab_py.vision.tracking.views import CameraView, leaders, seen_by, usable_alone
-from tests.vision.tracking.rendered import Rig, back_to_back, pixels_at, points_at, pose, stereo
+from tests.vision.tracking.rendered import (
+    HEIGHT,
+    WIDTH,
+    Rig,
+    back_to_back,
+    pixels_at,
+    points_at,
+    pose,
+    stereo,
+)
 from tests.vision.tracking.test_tracker import OPTIONS, common, run
 
 
@@ -110,3 +120,19 @@ def test_resized_images() -> None:
     errors = stereo_errors_px(rig, T_G_I, images)
     assert len(errors) > 30
     assert np.median(errors) < 0.3
+
+
+def test_cameras_of_different_sizes() -> None:
+    """Half the size means a level less: points are sought on those that both images have."""
+    rig, T_G_I = stereo(), pose()
+    first, second = rig.cameras
+    half = dataclasses.replace(
+        second, intrinsics=second.intrinsics / 2.0, width_px=WIDTH // 2, height_px=HEIGHT // 2
+    )
+    left, right = rig.images(T_G_I)
+    small = np.asarray(cv2.resize(right, (WIDTH // 2, HEIGHT // 2)), dtype=np.uint8)
+    for cameras, images in (((first, half), (left, small)), ((half, first), (small, left))):
+        tracker = FrameTracker(cameras, rig.T_I_C, OPTIONS)
+        tracker.track(0, images)
+        tracked = tracker.track(1, images, np.eye(3))
+        assert np.count_nonzero(tracked.cameras[0].num_frames == 2) > 20
