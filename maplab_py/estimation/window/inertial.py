@@ -162,7 +162,7 @@ class InertialChain:
     def relinearize(self, motion: F64) -> bool:
         """Integrate edges again whose biases (in F, 9) have moved far; tell whether any have."""
         self._integrate_stale()
-        biases = np.ascontiguousarray(motion[: len(self), 3:])
+        biases = motion[: len(self), 3:].copy()
         outdated = outdated_edges(biases, self._integrated_at, self._seen_at, self.duration_s)
         self._seen_at = biases
         self._integrate(outdated, biases[outdated])

@@ -7,6 +7,7 @@ from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
 from maplab_py.estimation.codegen.kernels import residual_kernel
 from maplab_py.estimation.symbolic import sources
+from maplab_py.estimation.window.frame import ImuPart
 from maplab_py.estimation.window.inertial import InertialChain
 from maplab_py.estimation.window.states import WindowStates
 from maplab_py.geometry import se3
@@ -104,6 +105,17 @@ def test_integrates_again_where_biases_moved(chain: InertialChain) -> None:
     fresh.append(*samples(1), motion[0], is_resting=False)
     fresh.append(*samples(2), motion[1], is_resting=False)
     np.testing.assert_array_equal(fresh.evaluate(T_M_I, motion, slice(None))[0], after)
+
+
+def test_a_doubt_leaves_the_states_as_they_are(chain: InertialChain) -> None:
+    chain.append(*samples(), MOTION, is_resting=False)
+    motion = np.tile(MOTION, (2, 1))
+    motion[0, 3] += 1e-6  # too little to integrate again
+    before = motion.copy()
+    assert not chain.relinearize(motion)
+    chain.doubt(0, ImuPart.GYROSCOPE)
+    chain.relinearize(before)
+    np.testing.assert_array_equal(motion, before)
 
 
 def test_walk_has_the_density_of_the_imu(chain: InertialChain) -> None:
