@@ -8,6 +8,7 @@ from maplab_py.frontend.odometry_options import OdometryOptions
 from maplab_py.interop.live.options import TRANSPORTS
 from maplab_py.interop.recordings.options import StreamOptions
 from maplab_py.options import Options, option
+from maplab_py.vision.features.options import NETWORKS
 
 DATA_SOURCES = ("auto", "euroc", "rosbag", "map", *TRANSPORTS)
 
@@ -98,9 +99,15 @@ class RunOptions(Options):
         """Check the values.
 
         Raises:
-            FlagError: A value is out of its range.
+            FlagError: A value is out of its range, or options contradict each other.
         """
         super().__post_init__()
         is_localized = self.localization.map_folder is not None
         if self.output.export_localized_poses_to_csv is not None and not is_localized:
             raise FlagError("--export_localized_poses_to_csv needs --vio_localization_map_folder")
+        features = self.localization.features or self.odometry.tracking.descriptor_type
+        if self.builder.features_every > 1 and features not in NETWORKS:
+            raise FlagError(
+                f"--vio_localization_features_every={self.builder.features_every}: a network describes "
+                "vertices only with --vio_localization_features=xfeat"
+            )

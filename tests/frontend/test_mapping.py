@@ -17,7 +17,7 @@ from maplab_py.frontend.health import HealthMonitor
 from maplab_py.frontend.mapping import Mapping
 from maplab_py.frontend.odometry_options import OdometryOptions
 from maplab_py.frontend.odometry_update import OdometryUpdate
-from maplab_py.frontend.run_options import OutputOptions, RunOptions
+from maplab_py.frontend.run_options import MapBuilderOptions, OutputOptions, RunOptions
 from maplab_py.geometry import so3
 from maplab_py.interop.recordings.map_replay import MapRecording
 from maplab_py.interop.recordings.options import StreamOptions
@@ -387,6 +387,7 @@ def test_real_time_playback() -> None:
             "needs a map",
         ),
         (RunOptions, {"realtime_playback_rate": -1.0}, "must be at least 0"),
+        (RunOptions, {"builder": MapBuilderOptions(features_every=5)}, "a network describes"),
         (StreamOptions, {"start_s": -1.0}, "vio_rosbag_start_s"),
     ],
 )
