@@ -278,9 +278,9 @@ class SessionImages:
     gain_jump: float = option(0.0, ge=0, lt=1)  # cameras jump to gains within 1 -+ gain_jump
     gain_jump_every_s: float = option(0.0, ge=0)  # mean time between the jumps; 0 = none
     repainted_share: float = option(0.0, ge=0, le=1)  # of the surfaces' area looks different
-    walkers: int = option(0, ge=0)  # people who cross the view, about a tenth of the image each
+    walkers: int = option(0, ge=0, le=100)  # people who cross the view, a tenth of the image each
     walkers_from_s: float = option(0.0, ge=0)
-    walkers_until_s: float = option(0.0, ge=0)  # 0 = to the end
+    walkers_until_s: float = option(0.0, ge=0, le=1e5)  # 0 = to the end
 
 
 @dataclasses.dataclass(frozen=True)
