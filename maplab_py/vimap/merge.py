@@ -1,6 +1,7 @@
 """Merge the missions of one map into another."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 
@@ -164,6 +165,17 @@ def _shift_resources(resources: tables.Resources, frames: int, missions: int) ->
     offset = np.where(resources.owner_kind == tables.ResourceOwner.FRAME, frames, missions)
     owned = (resources.owner_kind != tables.ResourceOwner.NONE) & (resources.owner >= 0)
     return resources.replace(owner=np.where(owned, resources.owner + offset, resources.owner))
+
+
+def at_folder(vi_map: VIMap, folder: Path | None) -> VIMap:
+    """Return a map that is about to be merged, whose own resources lie in the folder that it was loaded from.
+
+    Its metadata name another one if it was moved, or none.
+    """
+    if folder is None:
+        return vi_map
+    metadata = dataclasses.replace(vi_map.metadata, map_folder=str(folder.absolute()))
+    return vi_map.replace(metadata=metadata)
 
 
 def resource_folder_name(metadata: MapMetadata) -> str:

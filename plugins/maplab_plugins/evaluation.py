@@ -106,11 +106,13 @@ def map_of_key_or_folder(context: CommandContext, name: str) -> VIMap:
         UserError: There is none.
     """
     from maplab_py.storage.native import is_map_folder, load_map
+    from maplab_py.vimap.merge import at_folder
 
     if name in context.maps:
-        return context.maps.get(name).vi_map
+        entry = context.maps.get(name)
+        return at_folder(entry.vi_map, entry.folder)
     if is_map_folder(Path(name)):
-        return load_map(Path(name), progress=context.progress)[0]
+        return at_folder(load_map(Path(name), progress=context.progress)[0], Path(name))
     known = ", ".join(context.maps.keys)
     raise UserError(
         f"'{name}' is neither a map in memory ({known}) nor the folder of a map: name one of them"

@@ -1,5 +1,7 @@
 """Commands that keep a map up to date with new sessions."""
 
+from pathlib import Path
+
 from maplab_plugins.evaluation import map_of_key_or_folder
 from maplab_py.algorithms.keyframing.options import KeyframingOptions
 from maplab_py.algorithms.landmarks.persistence import PersistenceOptions
@@ -11,6 +13,7 @@ from maplab_py.algorithms.map_update.options import (
     UpdateOptions,
 )
 from maplab_py.plugin import CommandContext, Message, UserError, command
+from maplab_py.report import counted
 
 
 @command(
@@ -110,24 +113,36 @@ def map_log(context: CommandContext) -> ChronicleReport:
 def map_at(context: CommandContext, date: str) -> Message:
     """Return to the map as it was at the end of a day, from the differences that updates stored.
 
-    `undo` brings the present map back.
+    It is the map before the first update with a session of a later day. `undo` brings the present map back.
 
     Args:
         date: The day, as 2027-01-31.
     """
+    import numpy as np
+
     from maplab_py.algorithms.map_update.chronicle import map_before, records
+    from maplab_py.storage.resources.store import resource_path
+    from maplab_py.vimap import without_resources
 
     end_s = _seconds(date) + 86_400.0
-    known = records(context.vi_map, context.map_folder)
+    result, folder = context.vi_map, context.map_folder
+    known = records(result, folder)
     if not known:
         raise UserError("the map has no chronicle: update_map writes it")
-    result, dates = context.vi_map, [record.facts.date for record in known]
-    while known and _seconds(known[-1].facts.date) >= end_s:
-        result = map_before(result, known.pop())
-    if len(known) == len(dates):
-        return Message(f"the map is as it was on {date}: its last update is of {dates[-1]}")
-    context.commit(result)
-    return Message(f"the map is as it was before the update of {dates[len(known)]}")
+    last, when = known[-1], ""
+    for _ in range(len(known)):
+        if all(_seconds(record.facts.date) < end_s for record in known):
+            break
+        result, when = map_before(result, known[-1]), known[-1].facts.date
+        known = records(result, folder)  # without those that came with a session
+    if not when:
+        return Message(f"the map is as it was on {date}: its last update is of {last.facts.date}")
+    paths = (resource_path(result, row, folder or Path()) for row in range(len(result.resources)))
+    is_lost = np.array([not path.is_file() for path in paths], dtype=np.bool_)
+    context.commit(without_resources(result, is_lost))
+    lost = counted(int(is_lost.sum()), "resource")
+    without = f", without {lost} whose files are not in its folder" if is_lost.any() else ""
+    return Message(f"the map is as it was before the update of {when}{without}")
 
 
 def _seconds(date: str) -> float:

@@ -10,6 +10,7 @@ import hashlib
 import json
 import zlib
 from collections.abc import Iterator
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +78,7 @@ def on_newest_mission(vi_map: VIMap) -> VIMap:
 
 
 def records(vi_map: VIMap, map_folder: Path | None) -> list[Record]:
-    """Return the updates of a map, the oldest first.
+    """Return the updates of a map in the order in which they were made; other texts are skipped.
 
     Raises:
         MapError: A record is missing or damaged.
@@ -86,18 +87,19 @@ def records(vi_map: VIMap, map_folder: Path | None) -> list[Record]:
     for row in _texts(vi_map).tolist():
         path = resource_path(vi_map, row, map_folder or Path())
         try:
-            mark, _, rest = path.read_text(encoding="utf-8").partition("\n")
-            if mark != _MARK:
+            mark, _, rest = path.read_bytes().partition(b"\n")
+            if mark != _MARK.encode():
                 continue
-            head, content = rest.splitlines()
+            head, content = rest.decode().splitlines()
             facts, before, after = json.loads(head)
             record = UpdateRecord(**facts)
+            datetime.fromisoformat(record.date)
             result.append(Record(record, str(before), str(after), base64.b85decode(content)))
         except OSError as error:
             raise MapError(f"{path}: the record cannot be read ({error.strerror})") from None
-        except (ValueError, TypeError):
+        except (ValueError, TypeError, RecursionError):
             raise MapError(f"{path}: the record of an update is damaged") from None
-    return sorted(result, key=lambda record: record.facts.date)
+    return result
 
 
 def map_before(vi_map: VIMap, record: Record) -> VIMap:
@@ -115,7 +117,7 @@ def map_before(vi_map: VIMap, record: Record) -> VIMap:
         )
     try:
         result = restored(vi_map, record.differences)
-    except (ValueError, KeyError, TypeError, IndexError):
+    except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError):
         raise MapError(f"the record of the update of {when} is damaged") from None
     if checksum(result) != record.before:
         raise MapError(f"the record of the update of {when} is damaged")
@@ -127,8 +129,7 @@ def difference(before: VIMap, after: VIMap) -> bytes:
     head: dict[str, Any] = {"sensors": write_sensors(before.sensors), "columns": []}
     arrays: list[bytes] = []
     for table, name, column in _columns(before):
-        other = after.resources if table == "resources" else getattr(after, table)
-        rows, rest = _as_rows_of(column, other.columns()[name])
+        rows, rest = _as_rows_of(column, _table(after, table).columns()[name])
         values = _plain(rest) if rest.dtype == object else [rest.dtype.str, list(rest.shape)]
         head["columns"].append([table, name, len(rows), values])
         arrays.append(np.diff(rows, prepend=0).astype("<i4").tobytes())
@@ -151,7 +152,7 @@ def restored(after: VIMap, content: bytes) -> VIMap:
     for table, name, count, values in head["columns"]:
         rows = np.cumsum(np.frombuffer(plain, "<i4", count, place), dtype=np.int64)
         place += 4 * count
-        other = getattr(after, table).columns()[name]
+        other = _table(after, table).columns()[name]
         if other.dtype == object:
             rest = _objects(name, values)
         else:
@@ -185,6 +186,18 @@ def _columns(vi_map: VIMap) -> Iterator[tuple[str, str, NDArray[Any]]]:
         if isinstance(table, Table):
             for name, column in table.columns().items():
                 yield field.name, name, column
+
+
+def _table(vi_map: VIMap, name: str) -> Table:
+    """Return a table; resources in an order that neither files nor further records change."""
+    table: Table = getattr(vi_map, name)
+    if table is not vi_map.resources:
+        return table
+    resources, is_text = vi_map.resources, np.zeros(len(table), dtype=np.bool_)
+    is_text[_texts(vi_map)] = True
+    keys = (resources.timestamp_ns, *resources.sensor_id.T, *resources.id.T)
+    order = np.lexsort((*(np.where(is_text, 0, key) for key in keys), is_text))
+    return resources.take(order)
 
 
 def _as_rows_of(column: NDArray[Any], other: NDArray[Any]) -> tuple[I64, NDArray[Any]]:

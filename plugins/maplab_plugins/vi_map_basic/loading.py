@@ -342,17 +342,18 @@ def _merge_all(
 ) -> MergedMaps:
     """Load folders and merge them into the selected map, or into a new one if a key is given."""
     from maplab_py.vimap.edits import with_new_ids
-    from maplab_py.vimap.merge import merge_maps
+    from maplab_py.vimap.merge import at_folder, merge_maps
 
     loaded = _load_each(context, folders, reading)
     base = None if new_key else context.vi_map
     details: list[Report] = []
-    for vi_map, _ in loaded:
+    for (vi_map, _), folder in zip(loaded, folders, strict=True):
         context.progress.check()
         if base is None:
             base = with_new_ids(vi_map) if assign_new_ids else vi_map
             continue
-        base, report = merge_maps(base, vi_map, assign_new_ids=assign_new_ids)
+        other = at_folder(vi_map, folder)
+        base, report = merge_maps(base, other, assign_new_ids=assign_new_ids)
         details.append(report)
     return _hand_over(context, base, new_key, folders, details)
 

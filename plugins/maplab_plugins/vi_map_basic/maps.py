@@ -159,12 +159,13 @@ def merge_map(
         map_key: Key of the map to merge in.
         assign_new_ids: Give the merged-in missions, vertices and landmarks new ids.
     """
-    from maplab_py.vimap.merge import merge_maps
+    from maplab_py.vimap.merge import at_folder, merge_maps
 
     if map_key == context.map_key:
         raise UserError(f"merge_map: '{map_key}' is the selected map; name another one")
-    other = context.maps.get(map_key)
-    return context.apply(merge_maps, other.vi_map, assign_new_ids=assign_new_ids)
+    entry = context.maps.get(map_key)
+    other = at_folder(entry.vi_map, entry.folder)
+    return context.apply(merge_maps, other, assign_new_ids=assign_new_ids)
 
 
 @command("join_all_maps", example="join_all_maps --target_map_key=all", needs_map=False)

@@ -25,6 +25,9 @@ from maplab_py.errors import MapError, UserError
 from maplab_py.storage import maplab_map_pb2 as pb
 from maplab_py.storage.checksums import fingerprint
 from maplab_py.storage.native import load_map, save_map
+from maplab_py.storage.resources.files import missing_files
+from maplab_py.storage.resources.new import NewResources
+from maplab_py.vimap import ResourceOwner, VIMap
 from tests.algorithms.map_update.test_update import first, sessions, updated
 from tests.support.data import REPOSITORY
 
@@ -156,14 +159,14 @@ def test_readers_of_the_original_layout_skip_what_updates_add(tmp_path: Path) ->
 
 KILLED = """
 import sys
-from maplab_py.algorithms.map_update import update
+from maplab_py.algorithms.map_update import thinning
 from maplab_py.console.session.session import Session
 
 def thin(*_):
     print("ready", flush=True)
     sys.stdin.read()
 
-update.thin = thin
+thinning.thin = thin
 session = Session()
 session.run("load", map_folder=sys.argv[1])
 session.run("update_map", session=sys.argv[2])
@@ -190,3 +193,43 @@ def test_a_killed_update_leaves_the_stored_map_whole(folders: Path, tmp_path: Pa
     session.run("update_map", session=str(folders / "visit2"))
     session.run("save")
     assert len(session.run("map_log").updates) == 2
+
+
+def with_images(vi_map: VIMap) -> VIMap:
+    """Return a map with an image of every frame, and a text that is no record."""
+    new = NewResources(seed=vi_map.missions.id.tobytes())
+    image = np.zeros((4, 4), dtype=np.uint8)
+    rows = [new.add_image(image) for _ in range(len(vi_map.frames))]
+    vi_map = new.attached(vi_map, rows, np.arange(len(rows)))
+    return new.attached(vi_map, [new.add(11, b"caf\xe9")], [0], ResourceOwner.MISSION)
+
+
+def test_sessions_of_any_order_bring_their_images(tmp_path: Path) -> None:
+    save_map(with_images(first()), tmp_path / "office")
+    for number in (1, 2):
+        save_map(with_images(sessions().maps[number]), tmp_path / f"visit{number}")
+    session = Session()
+    session.run("load", map_folder=tmp_path / "office")
+    assert session.run("map_log").updates == ()
+    session.run("update_map", session=str(tmp_path / "visit2"))
+    session.run("save", map_folder=tmp_path / "late")
+    session.run("update_map", session=str(tmp_path / "visit1"), max_vertices=25)
+    session.run("save", map_folder=tmp_path / "early")
+    assert missing_files(session.vi_map, tmp_path / "early") == []
+    session = Session()
+    session.run("load", map_folder=tmp_path / "early")
+    late, early = session.run("map_log").updates
+    assert early.date < late.date
+    vi_map = session.vi_map
+    then = chronicle.map_before(vi_map, chronicle.records(vi_map, tmp_path / "early")[-1])
+    before = load_map(tmp_path / "late")[0].resources
+    kept = np.lexsort(before.id.T), np.lexsort(then.resources.id.T)
+    for name in ("id", "type", "owner_kind"):
+        columns = before.columns()[name][kept[0]], then.resources.columns()[name][kept[1]]
+        np.testing.assert_array_equal(*columns)
+    text = session.run("map_at", date="2020-10-20").text
+    assert "before the update of 2020-11-12 12:26, without" in text
+    assert missing_files(session.vi_map, tmp_path / "early") == []
+    assert chronicle.checksum(session.vi_map) == chronicle.checksum(
+        load_map(tmp_path / "office")[0]
+    )
