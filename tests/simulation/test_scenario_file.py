@@ -99,7 +99,7 @@ def test_a_file_overrides_what_it_names(tmp_path: Path) -> None:
         ("measurement: {frame_rate_hz: 500}", "measurement.frame_rate_hz: must not exceed"),
         ("sessions: [{images: {walkers: 1}}]", r"images.walkers: needs images.render: true"),
         ("sessions: [{images: {walkers: 1000}}]", r"images.walkers: must be .* at most 100"),
-        ("sessions: [{images: {walkers_until_s: 1e12}}]", r"walkers_until_s: must be .* at most"),
+        ("sessions: [{images: {walkers_until_s: 200000}}]", r"walkers_until_s: must be .* at most"),
         (
             "sessions: [{images: {walkers_from_s: 3, walkers_until_s: 2}}]",
             r"sessions\[0\].images.walkers_until_s: must be after",
