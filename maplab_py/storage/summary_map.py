@@ -157,9 +157,11 @@ def _with_extras(summary: SummaryMap, extras: Any, file: Path) -> SummaryMap:
         columns["sensors"] = sensors_yaml.parse_sensors(extras.sensors_yaml, f"{file}: sensors")
     existence = read_extension(extras.SerializeToString(), _EXISTENCE)
     if existence is not None:
-        if len(existence) != landmarks:
-            raise MapError(f"{file}: {len(existence)} probabilities of {landmarks} landmarks")
-        columns["existence_percent"] = np.frombuffer(existence, dtype=np.uint8)
+        columns["existence_percent"] = percent = np.frombuffer(existence, dtype=np.uint8)
+        if len(percent) != landmarks:
+            raise MapError(f"{file}: {len(percent)} probabilities of {landmarks} landmarks")
+        if percent.max(initial=0) > 100:
+            raise MapError(f"{file}: a landmark exists with a probability of {percent.max()} %")
     return dataclasses.replace(summary, **columns)
 
 

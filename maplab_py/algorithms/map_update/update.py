@@ -1,5 +1,6 @@
 """Update a map with a session: anchor, merge, optimise, gather evidence, keep the budget."""
 
+import dataclasses
 from datetime import UTC, datetime
 from typing import Any
 
@@ -43,7 +44,7 @@ from maplab_py.array_types import I64, NDArray
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import counted
-from maplab_py.vimap import IdArray, VIMap, edits, merge, to_hex
+from maplab_py.vimap import IdArray, VIMap, edits, merge, to_hex, to_hex_list
 
 _FIRST_ITERATIONS, _LOCAL_ITERATIONS = 10, 8
 _FREE, _FIXED = 150, 150
@@ -218,13 +219,31 @@ def changes_since(
         raise UserError(
             "the other map is in the selected one: --changes needs one of another session"
         )
+    renamed = session
     if shared:
-        session = edits.with_new_ids(session, edits.content_rng(vi_map, "changes", session))
-    prepared = prepare_session(session, progress=progress)
+        renamed = edits.with_new_ids(session, edits.content_rng(vi_map, "changes", session))
+    prepared = prepare_session(renamed, progress=progress)
     whole, *_ = merge_session(vi_map, prepared, progress=progress)
     later = np.zeros(len(whole.missions), dtype=np.bool_)
     later[whole.mission_index.rows(prepared.missions.id)] = True
-    return whole, changes.find_changes(whole, later, progress)
+    report = changes.find_changes(whole, later, progress)
+    if shared:
+        names = to_hex_list(renamed.vertices.id), to_hex_list(session.vertices.id)
+        report = _with_names(report, dict(zip(*names, strict=True)))
+    return whole, report
+
+
+def _with_names(report: ChangeReport, name: dict[str, str]) -> ChangeReport:
+    """Return the report with other names (ids) of vertices, as far as they have any."""
+    renamed = (
+        dataclasses.replace(
+            change,
+            view_before=name.get(change.view_before, change.view_before),
+            view_after=name.get(change.view_after, change.view_after),
+        )
+        for change in report.changes
+    )
+    return dataclasses.replace(report, changes=tuple(renamed))
 
 
 def _check_anchored(vi_map: VIMap) -> None:

@@ -200,7 +200,9 @@ def describe(summary: SummaryMap, file: Path) -> SummaryMapContent:
         has_projection=summary.projection is not None,
         cameras=sum(len(rig.cameras) for rig in sensors if isinstance(rig, CameraRig)),
         median_position_sigma_m=sigma,
-        mean_existence=None if percent is None else round(float(percent.mean()) / 100.0, 3),
+        mean_existence=round(float(percent.mean()) / 100.0, 3)
+        if percent is not None and len(percent)
+        else None,
         extent_m=(float(extent[0]), float(extent[1]), float(extent[2])),
         megabytes=file.stat().st_size * 1e-6,
     )

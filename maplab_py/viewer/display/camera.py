@@ -183,6 +183,8 @@ class Cameras:
 def window_of(camera: Any) -> Window:
     """Return the form of a page; all that are wide enough have the same."""
     aspect = float(camera.aspect)
+    if not aspect > 0.0:
+        return _WIDE  # a page that is folded away tells no form
     if aspect <= _PHONE:
         return aspect, 1.0, _FREE_HEIGHT
     free = 1.0 - _PANEL / aspect

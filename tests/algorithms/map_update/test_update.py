@@ -180,6 +180,11 @@ def test_furniture_that_moves_is_a_change_and_an_unchanged_room_has_none() -> No
         assert change.after <= change.until
     assert {change.change for change in report.changes} == {"vanished", "appeared"}
     assert max(change.size_m for change in report.changes) > 0.5
+    shared = maps[2].vertices.id.copy()
+    shared[0] = two.vertices.id[-1]  # parts of a recording share a vertex
+    part = maps[2].replace(vertices=maps[2].vertices.replace(id=shared))
+    for change in changes_since(two, part)[1].changes:
+        assert part.vertex_index.rows(np.array([from_hex(change.view_after)]))[0] >= 0
     with pytest.raises(UserError, match="earlier and later"):
         find_changes(two, np.zeros(2, dtype=np.bool_))
 
@@ -217,6 +222,10 @@ def test_a_summary_map_tells_the_probability_of_each_landmark(tmp_path: Path) ->
     wrong = dataclasses.replace(summary, existence_percent=again.existence_percent[:-1])
     write_summary_map(wrong, tmp_path, overwrite=True)
     with pytest.raises(MapError, match=r"probabilities of \d+ landmarks"):
+        read_summary_map(tmp_path)
+    wrong = dataclasses.replace(summary, existence_percent=again.existence_percent + np.uint8(101))
+    write_summary_map(wrong, tmp_path, overwrite=True)
+    with pytest.raises(MapError, match=r"a landmark exists with a probability of \d+ %"):
         read_summary_map(tmp_path)
 
 

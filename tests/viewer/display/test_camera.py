@@ -88,6 +88,9 @@ def test_narrow_pages_see_everything(size_px: tuple[int, int], right: float, low
     pages[2] = page(2, 300, 150)  # a page tells this before it is laid out
     pages[2].camera.position = np.array(server.initial_camera.position)
     connected[0](pages[2])
+    pages[2].camera.aspect = 0.0  # and this while it is folded away
+    pages[2].camera.heard[0](pages[2].camera)
+    assert np.isfinite(pages[2].camera.position).all()
     pages[2].camera.aspect = size_px[0] / size_px[1]
     pages[2].camera.heard[0](pages[2].camera)
     aspect = size_px[0] / size_px[1]
