@@ -31,6 +31,10 @@ _TEXT = 11
 """Number of the resource type of texts."""
 _MARK = "maplab-py update 1"
 """First line of a record; its facts and its differences follow."""
+_DAMAGES = (
+    ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError,
+    SyntaxError,  # of a dtype
+)  # fmt: skip
 _MULTIPLIER = np.uint64(0x9E3779B97F4A7C15)
 
 
@@ -117,7 +121,7 @@ def map_before(vi_map: VIMap, record: Record) -> VIMap:
         )
     try:
         result = restored(vi_map, record.differences)
-    except (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError):
+    except _DAMAGES:
         raise MapError(f"the record of the update of {when} is damaged") from None
     if checksum(result) != record.before:
         raise MapError(f"the record of the update of {when} is damaged")

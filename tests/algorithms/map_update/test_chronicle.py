@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from maplab_py.console.session.session import Session
 from maplab_py.errors import MapError, UserError
 from maplab_py.storage import maplab_map_pb2 as pb
 from maplab_py.storage.checksums import fingerprint
+from maplab_py.storage.extension_fields import PACKED, unpacked
 from maplab_py.storage.native import load_map, save_map
 from maplab_py.storage.resources.files import missing_files
 from maplab_py.storage.resources.new import NewResources
@@ -106,7 +108,13 @@ def test_the_session_is_an_input_of_the_card(folders: Path) -> None:
 def test_damaged_records_are_refused(folders: Path) -> None:
     vi_map = load_map(folders / "two")[0]
     record = chronicle.records(vi_map, folders / "two")[-1]
-    for content in (b"", record.differences[:-9], record.differences[:3] + b"x"):
+    plain = bytes(unpacked(record.differences))
+    of_content = [
+        PACKED + zlib.compress(plain.replace(old, new))
+        for old, new in ((b'"<u8"', b'",,,"'), (b'"vertices"', b'"vertexes"'), (b"[[", b"[" * 9999))
+    ]
+    whole = record.differences
+    for content in (b"", whole[:-9], whole[:3] + b"x", *of_content):
         with pytest.raises(MapError, match="record of the update of 2020-11-12 12:26 is damaged"):
             chronicle.map_before(vi_map, dataclasses.replace(record, differences=content))
     file = next((folders / "two").rglob("text/*.txt"))
