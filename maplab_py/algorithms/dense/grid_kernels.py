@@ -132,9 +132,6 @@ def find_neighbours(coordinates: I32, table: I64, around: I32) -> None:
 
 REFERENCE_DEPTH_M = 2.0
 """A measurement at this depth has the weight one."""
-_CLEAR_SHARE = 0.75
-"""Share of the depth up to which space is surely free, with the weight of its own depth: what moved near the
-camera goes when the wall behind it is seen."""
 
 
 @compiled()
@@ -201,7 +198,7 @@ def integrate_depth(
     # half a pixel more, so that cutting off the fraction rounds to the nearest pixel
     centre_u, centre_v = np.float32(image[1] + 0.5), np.float32(image[2] + 0.5)
     width, height = depth.shape[1], depth.shape[0]
-    reference, clear = np.float32(REFERENCE_DEPTH_M), np.float32(_CLEAR_SHARE)
+    reference = np.float32(REFERENCE_DEPTH_M)
     step0 = np.float32(voxel * T_C_G[0, 2])
     step1 = np.float32(voxel * T_C_G[1, 2])
     step2 = np.float32(voxel * T_C_G[2, 2])
@@ -235,10 +232,8 @@ def integrate_depth(
                     s = d - z_k
                     if d < near or d > far or s < -band:
                         continue
-                    ratio, w = reference / d, np.float32(1.0)
-                    if z_k < clear * d - band:
-                        ratio = reference / z_k
                     s = min(s * inverse_band, np.float32(1.0))
+                    ratio, w = reference / d, np.float32(1.0)
                     for _ in range(power):
                         w *= ratio
                     old = weight[block, i, j, k]

@@ -307,20 +307,6 @@ def test_no_triangle_touches_an_unobserved_cell() -> None:
     assert all(tuple(cell + offset) in observed for cell in cells for offset in offsets)
 
 
-def test_a_person_who_has_left_is_no_surface() -> None:
-    grid = TsdfGrid(SETTINGS)
-    wall = np.full((120, 160), 2.5, dtype=np.float32)
-    person = wall.copy()
-    person[30:90, 50:110] = 1.2
-    for depth in (person, wall):
-        grid.allocate(depth, PINHOLE, np.eye(4))
-    for depth in (person, wall, wall, wall):
-        grid.integrate(depth, PINHOLE, np.eye(4))
-    inner = np.abs(grid.mesh(0.1).p[:, :2]).max(axis=1) < 0.2
-    np.testing.assert_allclose(grid.mesh(0.1).p[inner][:, 2], 2.5, atol=0.01)
-    assert inner.sum() > 20
-
-
 def test_the_rim_of_the_band_is_no_surface() -> None:
     grid = TsdfGrid(SETTINGS)
     depth = np.zeros((120, 160), dtype=np.float32)
