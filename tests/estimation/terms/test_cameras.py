@@ -14,7 +14,7 @@ from maplab_py.estimation.states import ACCEL_BIAS, GYRO_BIAS, VELOCITY, States
 from maplab_py.estimation.symbolic import sources
 from maplab_py.estimation.symbolic.sources import absolute_pose, inertial, relative_pose
 from maplab_py.estimation.terms import inertial_calibration, protocol, wheel
-from maplab_py.estimation.terms.cameras import Cameras, camera_blocks
+from maplab_py.estimation.terms.cameras import EXTRINSICS, Cameras, camera_blocks
 from maplab_py.estimation.terms.pose import (
     SWITCH,
     AbsolutePoseTerm,
@@ -452,14 +452,21 @@ def evaluate(kernel: object, x: np.ndarray, size: int, columns: int) -> tuple[np
 
 
 def test_a_landmark_whose_step_overshoots_is_refined() -> None:
-    scene = make_scene(TWO_MODELS, line_delays=True)
-    scene.states = dataclasses.replace(scene.states, p_G=3.0 * scene.states.p_G)
-    r, J = dense_equations(scene)
-    nodes = 3 * scene.states.num_nodes
+    free = make_scene(TWO_MODELS, line_delays=False)
+    cameras = Cameras.of(
+        [make_camera(*model) for model in TWO_MODELS], free.states.blocks[EXTRINSICS].values
+    )
+    visual = VisualTerms(
+        visual_kernels(), free.visual.observations, cameras, VERTICES, loss=loss.Loss.CAUCHY
+    )
+    zero = np.zeros((VERTICES, 3))
+    states = States(free.states.T_G_I, zero, zero, zero, 3.0 * free.states.p_G)
+    r, J = dense_equations(Scene(visual, states, Problem(states, visual, ()), TWO_MODELS))
+    nodes = 3 * states.num_nodes
     step = np.linalg.solve(J[:, nodes:].T @ J[:, nodes:], -J[:, nodes:].T @ r).reshape(-1, 3)
-    plain = dataclasses.replace(scene.states, p_G=scene.states.p_G + step)
-    held = np.zeros((scene.states.num_nodes, 3))
-    p_G, cost, _ = scene.visual.take_step(scene.states, held, scene.states, 0.0)
-    assert cost < 0.9 * scene.visual.cost(plain)
-    refined = dataclasses.replace(scene.states, p_G=p_G)
-    assert cost == pytest.approx(scene.visual.cost(refined), rel=1e-12)
+    plain = dataclasses.replace(states, p_G=states.p_G + step)
+    held = np.zeros((states.num_nodes, 3))
+    p_G, cost, _ = visual.take_step(states, held, states, 0.0)
+    assert cost < 0.9 * visual.cost(plain)
+    refined = dataclasses.replace(states, p_G=p_G)
+    assert cost == pytest.approx(visual.cost(refined), rel=1e-12)

@@ -31,11 +31,13 @@ def landmark_cost(landmark, data, at, axes, prior, loss_kind, columns, room):
 
 
 @compiled(fastmath={"contract", "nsz"})
-def refine_landmark(landmark, data, at, axes, prior, loss_kind, columns, room, rho):
+def refine_landmark(landmark, data, at, axes, prior, loss_kind, room, rho):
     """Lower the cost `rho` of a landmark while all else is held; return what is left.
 
     Without these inner iterations few landmarks, of little parallax or seen wrongly, limit the steps of
-    all states (Ruhe and Wedin, Algorithms for separable nonlinear least squares problems, 1980).
+    all states (Ruhe and Wedin, Algorithms for separable nonlinear least squares problems, 1980). Not where
+    cameras are estimated: with pure rotation landmarks would come so near that the cameras' positions
+    seem to be determined.
     """
     out, h, f, g, d = room
     points, damping = at.p_G, 1e-3
@@ -46,15 +48,13 @@ def refine_landmark(landmark, data, at, axes, prior, loss_kind, columns, room, r
                 continue
             c, cameras = data.camera[o], (axes, at.parameters)
             reproject(at.T_G_I, data.vertex[o], cameras, c, points, landmark, data.uv_px, o, out, 0)
-            if columns > 0:
-                add_delay(out, data.uv_motion, at.timing_s, o, c)
             weighted(out, data.inverse_sigma[o], loss_kind, data.scale2[o])
             add_landmark_sums(out, h, g)
         factor_3x3(h, damping, f)
         promised = step_landmark(h, f, g, d)
         for j in range(3):
             points[landmark, j] += d[j]
-        new = landmark_cost(landmark, data, at, axes, prior, loss_kind, columns, room)
+        new = landmark_cost(landmark, data, at, axes, prior, loss_kind, 0, room)
         if new < rho:
             rho, damping = new, 0.1 * damping
         else:
@@ -117,10 +117,9 @@ def substitute(data, at, prior, rule, pose_step, camera_step, chunk_start, new, 
                 new_points[landmark, j] = points[landmark, j] + d[j]
             rho = landmark_cost(landmark, data, new, new_axes, prior, loss_kind, columns, room)
             missing = rho - before + gain
-            if move_points and missing > MISSING * abs(gain) + NEGLIGIBLE * before:
-                rho = refine_landmark(
-                    landmark, data, new, new_axes, prior, loss_kind, columns, room, rho
-                )
+            is_spoilt = missing > MISSING * abs(gain) + NEGLIGIBLE * before
+            if move_points and columns == 0 and is_spoilt:
+                rho = refine_landmark(landmark, data, new, new_axes, prior, loss_kind, room, rho)
             new_cost += rho
         sums[chunk, 0] = new_cost
         sums[chunk, 1] = decrease
