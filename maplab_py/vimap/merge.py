@@ -178,6 +178,12 @@ def at_folder(vi_map: VIMap, folder: Path | None) -> VIMap:
     return vi_map.replace(metadata=metadata)
 
 
+def without_folder(vi_map: VIMap, folder: Path | None) -> VIMap:
+    """Return a map that becomes part of a new one; its own resources stay in its folder of now."""
+    metadata, column = _joined_metadata(vi_map.metadata, at_folder(vi_map, folder))
+    return vi_map.replace(metadata=metadata, resources=vi_map.resources.replace(folder=column))
+
+
 def resource_folder_name(metadata: MapMetadata) -> str:
     """Return the name under which another map lists a map's own resource folder."""
     return f"{metadata.map_folder.rstrip('/')}/{metadata.map_resource_folder.removeprefix('./')}"

@@ -12,6 +12,8 @@ from maplab_py.errors import MapError, UserError
 from maplab_py.report import Message
 from maplab_py.storage.mission_names import named
 from maplab_py.storage.native import load_map, save_map
+from maplab_py.storage.resources.files import missing_files
+from maplab_py.storage.resources.new import NewResources
 from maplab_py.vimap import NO_ROW, ResourceOwner, Resources, VIMap, comparison
 from tests.console.sample_plugin import map_of
 from tests.vimap.builders import walk_map
@@ -29,6 +31,28 @@ def disk(tmp_path: Path) -> dict[Path, VIMap]:
     for number, folder in enumerate(folders):
         save_map(walk_map(seed=number), folder)
     return {folder: load_map(folder)[0] for folder in folders}
+
+
+@pytest.mark.parametrize(
+    "command", ["load_merge_all_maps", "load_merge_all_submaps", "join_all_maps"]
+)
+def test_a_joined_map_has_the_resources_of_all(
+    command: str, session: Session, tmp_path: Path
+) -> None:
+    for number in range(2):
+        new, vi_map = NewResources(), walk_map(seed=number)
+        image = np.full((4, 4), number, dtype=np.uint8)
+        save_map(new.attached(vi_map, [new.add_image(image)], [0]), tmp_path / f"walk_{number}")
+    if command == "join_all_maps":
+        session.run("load_all", maps_folder=tmp_path)
+        session.run(command, target_map_key="joined")
+    else:
+        session.run(command, maps_folder=tmp_path, target_map_key="joined")
+    assert missing_files(session.vi_map, None) == []
+    session.run("save", map_folder=tmp_path / "joined")
+    loaded = load_map(tmp_path / "joined")[0]
+    assert missing_files(loaded, tmp_path / "joined") == []
+    assert len(loaded.resources) == 2
 
 
 def test_load_selects_the_map_under_its_folders_name(

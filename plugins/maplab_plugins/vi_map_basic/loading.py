@@ -342,7 +342,7 @@ def _merge_all(
 ) -> MergedMaps:
     """Load folders and merge them into the selected map, or into a new one if a key is given."""
     from maplab_py.vimap.edits import with_new_ids
-    from maplab_py.vimap.merge import at_folder, merge_maps
+    from maplab_py.vimap.merge import at_folder, merge_maps, without_folder
 
     loaded = _load_each(context, folders, reading)
     base = None if new_key else context.vi_map
@@ -350,7 +350,8 @@ def _merge_all(
     for (vi_map, _), folder in zip(loaded, folders, strict=True):
         context.progress.check()
         if base is None:
-            base = with_new_ids(vi_map) if assign_new_ids else vi_map
+            base = without_folder(vi_map, folder)
+            base = with_new_ids(base) if assign_new_ids else base
             continue
         other = at_folder(vi_map, folder)
         base, report = merge_maps(base, other, assign_new_ids=assign_new_ids)
@@ -368,11 +369,14 @@ def _append_all(
 ) -> MergedMaps:
     """Load folders in time order and append each to its mission; the first part starts it."""
     from maplab_py.vimap.edits import with_new_ids
-    from maplab_py.vimap.merge import merge_maps
+    from maplab_py.vimap.merge import merge_maps, without_folder
     from maplab_py.vimap.submaps import append_submap
 
     loaded = _load_each(context, folders, reading)
-    pieces = sorted((vi_map for vi_map, _ in loaded), key=_start_time_ns)
+    located = (
+        without_folder(vi_map, folder) for (vi_map, _), folder in zip(loaded, folders, strict=True)
+    )
+    pieces = sorted(located, key=_start_time_ns)
     selected = None if new_key else context.vi_map
     base = None if assign_new_ids else selected
     details: list[Report] = []

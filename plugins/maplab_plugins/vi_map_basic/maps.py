@@ -178,17 +178,18 @@ def join_all_maps(
         target_map_key: Key of the new map, which is selected.
         assign_new_ids: Give the merged-in missions, vertices and landmarks new ids.
     """
-    from maplab_py.vimap.merge import merge_maps
+    from maplab_py.vimap.merge import merge_maps, without_folder
 
     entries = list(context.maps)
     if len(entries) < 2:
         raise UserError(f"join_all_maps: needs two or more maps, {len(entries)} in memory")
     if target_map_key not in context.maps:
         context.maps.check_new_key(target_map_key)
-    joined = entries[0].vi_map
+    joined = without_folder(entries[0].vi_map, entries[0].folder)
     for done, entry in enumerate(entries[1:], start=1):
         context.progress.step(done, len(entries), f"merge {entry.key}")
-        joined, report = merge_maps(joined, entry.vi_map, assign_new_ids=assign_new_ids)
+        other = without_folder(entry.vi_map, entry.folder)
+        joined, report = merge_maps(joined, other, assign_new_ids=assign_new_ids)
     for entry in entries:
         context.maps.remove(entry.key)
     context.maps.add(target_map_key, joined)
