@@ -106,7 +106,7 @@ CONSOLE = (
     Fault(
         "blanks_in_batch_folders",
         "maplab_py/console/scripts/batch.py",
-        ".replace(FOLDER_TEMPLATE, escaped(folder))",
+        ".replace(FOLDER_TEMPLATE, lines.escaped(folder))",
         ".replace(FOLDER_TEMPLATE, folder)",
         _BATCH,
     ),

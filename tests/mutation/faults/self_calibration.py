@@ -60,7 +60,7 @@ SELF_CALIBRATION = (
     Fault(
         "scores_at_another_calibration",
         "maplab_py/algorithms/self_calibration/segments/selection.py",
-        "        source = with_device_of(source, database.vi_map)\n",
+        "        source = device.with_device_of(source, database.vi_map)\n",
         "        source = source.replace()\n",
         _SINGLE,
     ),

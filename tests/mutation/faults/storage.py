@@ -53,8 +53,8 @@ STORAGE = (
     Fault(
         "checksums_not_verified",
         "maplab_py/storage/map_loading.py",
-        "    files = listed_files(folder, budget.max_bytes)\n    checksums.verify(folder, listed)\n",
-        "    files = listed_files(folder, budget.max_bytes)\n",
+        "listed_files(folder, budget.max_bytes)\n    checksums.verify(folder, listed)\n",
+        "listed_files(folder, budget.max_bytes)\n",
         _MAPS,
     ),
     Fault(
