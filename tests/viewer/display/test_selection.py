@@ -49,9 +49,9 @@ class OpenPage:
         self._connection = connection
         self.state = PageState()
         self._read(lambda messages: any(map(is_replayed, messages)))
-        before = viewer.pages
+        before = set(viewer.selections.pages)  # pages that have been closed may still leave
         connection.send(msgspec.msgpack.encode(CAMERA))
-        assert wait_until(lambda: viewer.pages > before, 20.0)
+        assert wait_until(lambda: bool(set(viewer.selections.pages) - before), 20.0)
         self.wait_for_text(text)
 
     def _read(self, is_enough: Callable[[list[Message]], bool]) -> None:
@@ -90,7 +90,8 @@ def test_each_page_has_its_selection_and_the_console_selects_in_all(viewer: View
         second.click(viewer, 3)
         second.wait_for_text("4 of 14")
         assert "8 of 14" not in second.state.html
-        assert told == [to_hex(MAP.vertices.id[row]) for row in (7, 3)]
+        ids = [to_hex(MAP.vertices.id[row]) for row in (7, 3)]
+        assert wait_until(lambda: told == ids, 20.0)  # after the marks have been sent
         assert viewer.selection.picked is not None
         assert viewer.selection.picked.row == 3
         viewer.select(Pick(Entity.VERTEX, 11, viewer.drawing.p_vertices[11], 0.0))
