@@ -176,7 +176,7 @@ class SolverFlags(Options):
     """Accept steps that increase the cost temporarily"""
     max_consecutive_nonmonotonic_steps: int = 5
     """Largest number of consecutive steps that may increase the cost"""
-    initial_trust_region_radius: float = 1e5
+    initial_trust_region_radius: float = 1e8
     """Initial radius of the trust region"""
     max_trust_region_radius: float = 1e20
     """Largest radius of the trust region."""
