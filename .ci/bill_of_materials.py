@@ -15,7 +15,7 @@ components = [
         "purl": f"pkg:pypi/{each.metadata['Name'].lower().replace('_', '-')}@{each.version}",
         **(
             {"licenses": [{"license": {"name": licence}}]}
-            if (licence := each.metadata["License-Expression"] or each.metadata["License"])
+            if (licence := each.metadata.get("License-Expression") or each.metadata.get("License"))
             else {}
         ),
     }
