@@ -71,7 +71,7 @@ def main() -> None:
         else:
             vi_map, _ = update_map(vi_map, session.vi_map, options)
             record = chronicle.records(vi_map, None)[-1]
-            facts = vars(record.facts) | {"stored_kb": round(1e-3 * len(record.differences), 1)}
+            facts = vars(record.facts[-1]) | {"stored_kb": round(1e-3 * len(record.differences), 1)}
             sys.stdout.write(json.dumps({"number": number + 1} | facts) + "\n")
         if number == BUDGET_SESSIONS - 1:
             good = int(np.count_nonzero(vi_map.landmarks.quality == 2))

@@ -10,7 +10,7 @@ from maplab_py.geometry import se3, so3
 from maplab_py.vimap.ids import IdArray, is_valid, random_ids
 from maplab_py.vimap.selection import as_mask, as_rows, keep_rows
 from maplab_py.vimap.table import object_column
-from maplab_py.vimap.tables import NO_ROW, LandmarkQuality, Landmarks
+from maplab_py.vimap.tables import NO_ROW, LandmarkQuality, Landmarks, ResourceOwner
 from maplab_py.vimap.vertex_removal import move_landmarks, remove_vertices, stores_for
 from maplab_py.vimap.vi_map import VIMap
 
@@ -27,23 +27,51 @@ __all__ = [
     "with_p_G",
 ]
 
+_TEXT = 11
+"""Number of the resource type of texts."""
+
 
 def remove_missions(vi_map: VIMap, missions: ArrayLike) -> VIMap:
     """Remove missions with their vertices, edges, resources and landmarks.
 
     Landmarks that another mission observes are stored in their first observer there and keep their
-    position in G. Loop closure edges to the removed missions are removed.
+    position in G. Loop closure edges to the removed missions are removed. Texts, as the records of updates
+    are, go to the newest mission that stays.
 
     Args:
         missions: Mission rows or a mask (M,).
     """
     removed = as_mask(missions, len(vi_map.missions))
+    vi_map = with_texts_on_newest(vi_map, ~removed)
     vertex_kept = ~removed[vi_map.vertices.mission]
     homeless = np.flatnonzero(~vertex_kept[vi_map.landmarks.vertex])
     store = stores_for(vi_map, homeless, vertex_kept, same_mission=False)
     stored = store >= 0
     vi_map = move_landmarks(vi_map, homeless[stored], store[stored])
     return keep_rows(vi_map, missions=np.flatnonzero(~removed))
+
+
+def texts_of_missions(vi_map: VIMap) -> I64:
+    """Return the resources (rows) that are texts of missions."""
+    table = vi_map.resources
+    return np.flatnonzero((table.type == _TEXT) & (table.owner_kind == ResourceOwner.MISSION))
+
+
+def with_texts_on_newest(vi_map: VIMap, missions: Mask) -> VIMap:
+    """Return the map with the texts of all missions on the newest of some missions (M,)."""
+    rows = texts_of_missions(vi_map)
+    if len(rows) == 0 or not missions.any():
+        return vi_map
+    owner = vi_map.resources.owner.copy()
+    owner[rows] = newest_mission(vi_map, missions)
+    return vi_map.replace(resources=vi_map.resources.replace(owner=owner))
+
+
+def newest_mission(vi_map: VIMap, missions: Mask) -> int:
+    """Return the row of the mission among some (M,) that begins last."""
+    first = np.minimum(vi_map.vertex_start[:-1], max(len(vi_map.vertices) - 1, 0))
+    chosen = np.flatnonzero(missions)
+    return int(chosen[np.argmax(vi_map.vertices.timestamp_ns[first[chosen]])])
 
 
 def remove_landmarks(vi_map: VIMap, landmarks: ArrayLike) -> VIMap:

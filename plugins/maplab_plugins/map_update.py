@@ -1,5 +1,6 @@
 """Commands that keep a map up to date with new sessions."""
 
+from datetime import UTC, datetime
 from pathlib import Path
 
 from maplab_plugins.evaluation import map_of_key_or_folder
@@ -54,6 +55,7 @@ def update_map(
         loop_options,
         keyframing,
         assign_new_ids=assign_new_ids,
+        map_folder=context.map_folder,
         progress=context.progress,
     )
 
@@ -106,37 +108,36 @@ def map_log(context: CommandContext) -> ChronicleReport:
 
     known = records(context.vi_map, context.map_folder)
     stored_kb = round(sum(len(record.differences) for record in known) * 1e-3, 1)
-    return ChronicleReport(tuple(record.facts for record in known), stored_kb)
+    updates = tuple(fact for record in known for fact in record.facts)
+    return ChronicleReport(updates, sum(bool(r.differences) for r in known), stored_kb)
 
 
 @command("map_at", example="map_at --date=2020-01-31", see_also=("map_log", "undo"))
 def map_at(context: CommandContext, date: str) -> Message:
     """Return to the map as it was at the end of a day, from the differences that updates stored.
 
-    It is the map before the first update with a session of a later day. `undo` brings the present map back.
+    It is the map before the first update with a session of a later day. Twelve states are kept: of old
+    updates some have become one. `undo` brings the present map back.
 
     Args:
         date: The day, as 2027-01-31.
     """
     import numpy as np
 
-    from maplab_py.algorithms.map_update.chronicle import map_before, records
+    from maplab_py.algorithms.map_update import chronicle
     from maplab_py.storage.resources.store import resource_path
     from maplab_py.vimap import without_resources
 
-    end_s = _seconds(date) + 86_400.0
-    result, folder = context.vi_map, context.map_folder
-    known = records(result, folder)
+    end = f"{datetime.fromtimestamp(_seconds(date), UTC):%Y-%m-%d} 24"
+    folder = context.map_folder
+    known = chronicle.records(context.vi_map, folder)
     if not known:
         raise UserError("the map has no chronicle: update_map writes it")
-    last, when = known[-1], ""
-    for _ in range(len(known)):
-        if all(_seconds(record.facts.date) < end_s for record in known):
-            break
-        result, when = map_before(result, known[-1]), known[-1].facts.date
-        known = records(result, folder)  # without those that came with a session
-    if not when:
-        return Message(f"the map is as it was on {date}: its last update is of {last.facts.date}")
+    result, update = chronicle.map_at(context.vi_map, folder, end)
+    if update is None:
+        last = known[-1].facts[-1].date
+        return Message(f"the map is as it was on {date}: its last update is of {last}")
+    when = update.date
     paths = (resource_path(result, row, folder or Path()) for row in range(len(result.resources)))
     is_lost = np.array([not path.is_file() for path in paths], dtype=np.bool_)
     context.commit(without_resources(result, is_lost))
@@ -146,8 +147,6 @@ def map_at(context: CommandContext, date: str) -> Message:
 
 
 def _seconds(date: str) -> float:
-    from datetime import UTC, datetime
-
     try:
         return datetime.fromisoformat(date).replace(tzinfo=UTC).timestamp()
     except (ValueError, OverflowError):

@@ -1,12 +1,14 @@
 """Chronicle of a map: what each update did, and what leads back to the map before it.
 
-A record is a text among the resources of the newest mission: its report, and the columns of the map before
-as differences from those after it. Rows of a column that both maps hold are numbers of rows.
+A record is a text among the resources of the newest mission: reports of updates, and the columns of the map
+before them as differences from those after. Rows of a column that both maps hold are numbers of rows. A map
+keeps few differences: beyond them two neighbours become one, which leads back over both.
 """
 
 import base64
 import dataclasses
 import hashlib
+import itertools
 import json
 import zlib
 from collections.abc import Iterator
@@ -23,14 +25,17 @@ from maplab_py.sensors.sensors_yaml import parse_sensors, write_sensors
 from maplab_py.storage.extension_fields import PACKED, unpacked
 from maplab_py.storage.resources.new import NewResources
 from maplab_py.storage.resources.store import MAP_FOLDER, resource_path
-from maplab_py.vimap import IdIndex, ResourceOwner, VIMap
+from maplab_py.vimap import IdIndex, ResourceOwner, VIMap, edits, to_hex_list, without_resources
 from maplab_py.vimap.descriptors import DescriptorBlock
 from maplab_py.vimap.table import Table, object_column
+from maplab_py.vimap.tables import Resources
 
 _TEXT = 11
 """Number of the resource type of texts."""
-_MARK = "maplab-py update 1"
+_MARK = "maplab-py update 2"
 """First line of a record; its facts and its differences follow."""
+_STATES, _RECENT = 12, 4
+"""Earlier states that a map leads back to, and how many of the newest stay one by one."""
 _DAMAGES = (
     ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RecursionError,
     SyntaxError,  # of a dtype
@@ -40,12 +45,19 @@ _MULTIPLIER = np.uint64(0x9E3779B97F4A7C15)
 
 @dataclasses.dataclass(frozen=True)
 class Record:
-    """An update of a map."""
+    """Updates of a map, of which the oldest is the first."""
 
-    facts: UpdateRecord
+    number: int  # in the order in which records were made
+    facts: tuple[UpdateRecord, ...]
     before: str  # checksums of the maps
     after: str
-    differences: bytes
+    differences: bytes  # empty where they lead nowhere any more
+
+    def content(self) -> bytes:
+        """Return the text of the record."""
+        facts = [dataclasses.asdict(fact) for fact in self.facts]
+        head = json.dumps([self.number, facts, self.before, self.after])
+        return f"{_MARK}\n{head}\n{base64.b85encode(self.differences).decode()}\n".encode()
 
 
 def stored_order(vi_map: VIMap) -> VIMap:
@@ -56,29 +68,73 @@ def stored_order(vi_map: VIMap) -> VIMap:
     return vi_map.replace(landmarks=vi_map.landmarks.take(order), keypoints=keypoints)
 
 
-def with_record(before: VIMap, after: VIMap, report: MapUpdateReport) -> VIMap:
+def with_record(
+    before: VIMap, after: VIMap, report: MapUpdateReport, map_folder: Path | None = None
+) -> VIMap:
     """Return the updated map, whose landmarks are in stored order, with a record of the update.
+
+    Args:
+        before: The map before the update.
+        after: The map after it.
+        report: Of the update.
+        map_folder: Folder of the map, whose records are read.
 
     Raises:
         UserError: The record cannot be written, as on a full disk.
+        MapError: A record of the map is missing or damaged.
     """
     before = stored_order(before)
-    facts = UpdateRecord.of(report)
-    head = json.dumps([dataclasses.asdict(facts), checksum(before), checksum(after)])
-    content = base64.b85encode(difference(before, after)).decode()
-    new = NewResources(seed=after.missions.id.tobytes())
-    row = new.add(_TEXT, f"{_MARK}\n{head}\n{content}\n".encode())
-    newest = int(np.argmax(_begins(after)))
-    return new.attached(after, [row], [newest], ResourceOwner.MISSION)
+    known = _records(after, map_folder)
+    came_with = IdIndex(before.resources.id).rows(after.resources.id) < 0  # the session
+    mine = [record for record, row in known if not came_with[row]]
+    number = max((record.number for record in mine), default=0) + 1
+    facts, states = UpdateRecord.of(report), (checksum(before), checksum(after))
+    new = Record(number, (facts,), *states, difference(before, after))
+    chain = _chain(mine, new.before)
+    merged = _merged(chain, before) if len(chain) + 1 > _STATES else ()
+    written, removed = [], np.zeros(len(after.resources), dtype=np.bool_)
+    for record, row in known:
+        lasting: Record | None = record
+        if came_with[row]:
+            lasting = dataclasses.replace(record, number=number, after="", differences=b"")
+        elif merged and record in merged[1:]:
+            lasting = merged[0] if record is merged[1] else None
+        elif record not in chain:
+            lasting = dataclasses.replace(record, differences=b"")
+        if lasting != record:
+            removed[row] = True
+            written += [] if lasting is None else [lasting]
+    texts = NewResources(seed=after.missions.id.tobytes())
+    rows = [texts.add(_TEXT, record.content()) for record in (*written, new)]
+    owner = edits.newest_mission(after, np.ones(len(after.missions), dtype=np.bool_))
+    kept = without_resources(after, removed)
+    return texts.attached(kept, rows, [owner] * len(rows), ResourceOwner.MISSION)
 
 
-def on_newest_mission(vi_map: VIMap) -> VIMap:
-    """Return the map with the texts of its missions on the newest mission, which an update keeps."""
-    table = vi_map.resources
-    rows = _texts(vi_map)
-    owner = table.owner.copy()
-    owner[rows] = int(np.argmax(_begins(vi_map)))
-    return vi_map.replace(resources=table.replace(owner=owner)) if len(rows) else vi_map
+def _chain(known: list[Record], state: str) -> list[Record]:
+    """Return the records that lead back from a state (checksum) one after the other, the newest first."""
+    chain = []
+    for record in known[::-1]:
+        if record.after == state and record.differences:
+            chain.append(record)
+            state = record.before
+    return chain
+
+
+def _merged(chain: list[Record], latest: VIMap) -> tuple[Record, Record, Record]:
+    """Return two neighbours of a chain that leads back from a map as one, the later and the earlier.
+
+    They are those of the fewest updates among all but the newest, the oldest first.
+    """
+    updates = [len(a.facts) + len(b.facts) for a, b in itertools.pairwise(chain)]
+    place = min(range(_RECENT, len(updates)), key=lambda row: (updates[row], -row))
+    for record in chain[:place]:
+        latest = map_before(latest, record)
+    later, earlier = chain[place : place + 2]
+    content = difference(map_before(map_before(latest, later), earlier), latest)
+    facts = (*earlier.facts, *later.facts)
+    both = Record(later.number, facts, earlier.before, later.after, content)
+    return both, later, earlier
 
 
 def records(vi_map: VIMap, map_folder: Path | None) -> list[Record]:
@@ -87,23 +143,58 @@ def records(vi_map: VIMap, map_folder: Path | None) -> list[Record]:
     Raises:
         MapError: A record is missing or damaged.
     """
+    return [record for record, _ in _records(vi_map, map_folder)]
+
+
+def _records(vi_map: VIMap, map_folder: Path | None) -> list[tuple[Record, int]]:
+    """Return the records and the resources (rows) that hold them."""
     result = []
-    for row in _texts(vi_map).tolist():
+    for row in edits.texts_of_missions(vi_map).tolist():
         path = resource_path(vi_map, row, map_folder or Path())
         try:
             mark, _, rest = path.read_bytes().partition(b"\n")
             if mark != _MARK.encode():
                 continue
-            head, content = rest.decode().splitlines()
-            facts, before, after = json.loads(head)
-            record = UpdateRecord(**facts)
-            datetime.fromisoformat(record.date)
-            result.append(Record(record, str(before), str(after), base64.b85decode(content)))
+            head, content = (rest.decode() + "\n").split("\n")[:2]
+            number, facts, before, after = json.loads(head)
+            updates = tuple(UpdateRecord(**fact) for fact in facts)
+            for update in updates:
+                datetime.fromisoformat(update.date)
+            result.append((Record(
+                int(number), updates, str(before), str(after), base64.b85decode(content)
+            ), row))  # fmt: skip
         except OSError as error:
             raise MapError(f"{path}: the record cannot be read ({error.strerror})") from None
         except (ValueError, TypeError, RecursionError):
             raise MapError(f"{path}: the record of an update is damaged") from None
-    return result
+    return sorted(result, key=lambda item: item[0].number)
+
+
+def map_at(vi_map: VIMap, map_folder: Path | None, end: str) -> tuple[VIMap, UpdateRecord | None]:
+    """Return the map as it was before its first update with a session after a time, and that update.
+
+    Args:
+        vi_map: The map.
+        map_folder: Its folder.
+        end: The time, as in the dates of updates. None of them is after it: the map stays.
+
+    Raises:
+        MapError: Other commands changed the map since, or a record is damaged.
+    """
+    mine = [(record, row) for record, row in _records(vi_map, map_folder) if record.after]
+    result, first = vi_map, None
+    while any(fact.date >= end for record, _ in mine for fact in record.facts):
+        record, _ = mine.pop()
+        result, first = map_before(result, record), record.facts[0]
+    if first is None:
+        return vi_map, None
+    rows = [row for _, row in mine]
+    texts = vi_map.resources.take(np.array(rows, dtype=np.int64))
+    owner = edits.newest_mission(result, np.ones(len(result.missions), dtype=np.bool_))
+    texts = texts.replace(owner=np.full(len(texts), owner))
+    is_new = IdIndex(result.resources.id).rows(texts.id) < 0
+    joined = Resources.concatenate([result.resources, texts.take(is_new)])
+    return result.replace(resources=joined), first
 
 
 def map_before(vi_map: VIMap, record: Record) -> VIMap:
@@ -113,7 +204,7 @@ def map_before(vi_map: VIMap, record: Record) -> VIMap:
         MapError: It is not the map after that update, or the record is damaged.
     """
     vi_map = stored_order(vi_map)
-    when = record.facts.date
+    when = record.facts[-1].date
     if checksum(vi_map) != record.after:
         raise MapError(
             f"other commands changed the map after the update of {when}: its state before cannot be "
@@ -130,10 +221,13 @@ def map_before(vi_map: VIMap, record: Record) -> VIMap:
 
 def difference(before: VIMap, after: VIMap) -> bytes:
     """Return what leads from the map after an update back to that before it."""
-    head: dict[str, Any] = {"sensors": write_sensors(before.sensors), "columns": []}
+    texts = to_hex_list(before.resources.id[edits.texts_of_missions(before)])
+    sensors = write_sensors(before.sensors)
+    head: dict[str, Any] = {"sensors": sensors, "texts": texts, "columns": []}
     arrays: list[bytes] = []
+    before, after = _without_texts(before), _without_texts(after)
     for table, name, column in _columns(before):
-        rows, rest = _as_rows_of(column, _table(after, table).columns()[name])
+        rows, rest = _as_rows_of(column, getattr(after, table).columns()[name])
         values = _plain(rest) if rest.dtype == object else [rest.dtype.str, list(rest.shape)]
         head["columns"].append([table, name, len(rows), values])
         arrays.append(np.diff(rows, prepend=0).astype("<i4").tobytes())
@@ -153,10 +247,11 @@ def restored(after: VIMap, content: bytes) -> VIMap:
     place = 4 + int.from_bytes(plain[:4], "little")
     head = json.loads(plain[4:place])
     columns: dict[str, dict[str, NDArray[Any]]] = {}
+    plain_map = _without_texts(after)
     for table, name, count, values in head["columns"]:
         rows = np.cumsum(np.frombuffer(plain, "<i4", count, place), dtype=np.int64)
         place += 4 * count
-        other = _table(after, table).columns()[name]
+        other = getattr(plain_map, table).columns()[name]
         if other.dtype == object:
             rest = _objects(name, values)
         else:
@@ -168,8 +263,11 @@ def restored(after: VIMap, content: bytes) -> VIMap:
     tables = {table: type(getattr(after, table))(**values) for table, values in columns.items()}
     known = IdIndex(after.resources.id).rows(tables["resources"].columns()["id"])
     folder = np.append(after.resources.folder, MAP_FOLDER)[known]  # others are in the map's folder
-    tables["resources"] = tables["resources"].replace(folder=folder)
-    return after.replace(sensors=parse_sensors(head["sensors"], "record"), **tables)
+    texts = after.resources.take(edits.texts_of_missions(after))
+    texts = texts.take(np.isin(to_hex_list(texts.id), head["texts"]))
+    tables["resources"] = Resources.concatenate([tables["resources"].replace(folder=folder), texts])
+    result = after.replace(sensors=parse_sensors(head["sensors"], "record"), **tables)
+    return edits.with_texts_on_newest(result, np.ones(len(result.missions), dtype=np.bool_))
 
 
 def checksum(vi_map: VIMap) -> str:
@@ -192,16 +290,12 @@ def _columns(vi_map: VIMap) -> Iterator[tuple[str, str, NDArray[Any]]]:
                 yield field.name, name, column
 
 
-def _table(vi_map: VIMap, name: str) -> Table:
-    """Return a table; resources in an order that neither files nor further records change."""
-    table: Table = getattr(vi_map, name)
-    if table is not vi_map.resources:
-        return table
-    resources, is_text = vi_map.resources, np.zeros(len(table), dtype=np.bool_)
-    is_text[_texts(vi_map)] = True
-    keys = (resources.timestamp_ns, *resources.sensor_id.T, *resources.id.T)
-    order = np.lexsort((*(np.where(is_text, 0, key) for key in keys), is_text))
-    return resources.take(order)
+def _without_texts(vi_map: VIMap) -> VIMap:
+    """Return the map without texts; its resources in an order that files do not change."""
+    table = vi_map.resources
+    table = table.take(np.setdiff1d(np.arange(len(table)), edits.texts_of_missions(vi_map)))
+    order = np.lexsort((table.timestamp_ns, *table.sensor_id.T, *table.id.T))
+    return vi_map.replace(resources=table.take(order))
 
 
 def _as_rows_of(column: NDArray[Any], other: NDArray[Any]) -> tuple[I64, NDArray[Any]]:
@@ -261,13 +355,3 @@ def _objects(name: str, values: list[Any]) -> NDArray[Any]:
             [None if v is None else tuple(DescriptorBlock(*block) for block in v) for v in values]
         )
     return object_column([str(value) for value in values])
-
-
-def _texts(vi_map: VIMap) -> I64:
-    table = vi_map.resources
-    return np.flatnonzero((table.type == _TEXT) & (table.owner_kind == ResourceOwner.MISSION))
-
-
-def _begins(vi_map: VIMap) -> I64:
-    rows = np.minimum(vi_map.vertex_start[:-1], max(len(vi_map.vertices) - 1, 0))
-    return np.asarray(vi_map.vertices.timestamp_ns[rows])

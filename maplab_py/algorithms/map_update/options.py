@@ -136,4 +136,5 @@ class ChronicleReport(Report):
     """Updates of a map, the oldest first."""
 
     updates: tuple[UpdateRecord, ...]
+    states: int  # earlier maps that map_at returns to
     stored_kb: float  # of the differences that lead back

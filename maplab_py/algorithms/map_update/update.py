@@ -2,6 +2,7 @@
 
 import dataclasses
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -91,6 +92,7 @@ def update_map(
     keyframing: KeyframingOptions = _KEYFRAMING,
     *,
     assign_new_ids: bool = False,
+    map_folder: Path | None = None,
     progress: Progress = SILENT,
 ) -> tuple[VIMap, MapUpdateReport]:
     """Update a map with the missions of a session.
@@ -103,6 +105,7 @@ def update_map(
         loops: How places are recognised.
         keyframing: Of the session.
         assign_new_ids: Whether the session may be in the map already; it is added once more.
+        map_folder: Folder of the map, which has its chronicle.
 
     Raises:
         UserError: No mission of the map is anchored, or the budget cannot be met.
@@ -115,7 +118,8 @@ def update_map(
     merge.check_disjoint(vi_map, session)
     prepared = prepare_session(session, keyframing, progress=progress)
     whole, merged, localized = merge_session(vi_map, prepared, loops, progress=progress)
-    whole = chronicle.on_newest_mission(whole)
+    every = np.ones(len(whole.missions), dtype=np.bool_)
+    whole = edits.with_texts_on_newest(whole, every)
     lines = []
     new_ids = prepared.missions.id
     for mission in whole.mission_index.rows(new_ids).tolist():
@@ -149,7 +153,7 @@ def update_map(
             if line.predicted == 0
         ),
     )
-    return chronicle.with_record(vi_map, result, report), report
+    return chronicle.with_record(vi_map, result, report, map_folder), report
 
 
 def _localized(vi_map: VIMap, session: VIMap, progress: Progress) -> float:

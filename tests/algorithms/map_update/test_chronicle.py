@@ -29,7 +29,8 @@ from maplab_py.storage.extension_fields import PACKED, unpacked
 from maplab_py.storage.native import load_map, save_map
 from maplab_py.storage.resources.files import missing_files
 from maplab_py.storage.resources.new import NewResources
-from maplab_py.vimap import ResourceOwner, VIMap
+from maplab_py.vimap import ResourceOwner, VIMap, without_resources
+from maplab_py.vimap.edits import remove_landmarks, remove_missions
 from tests.algorithms.map_update.test_update import first, sessions, updated
 from tests.support.data import REPOSITORY
 
@@ -146,6 +147,46 @@ def test_records_stay_when_their_mission_goes() -> None:
     vi_map, _ = update_map(updated()[0], sessions().maps[2], BUDGET)
     assert len(chronicle.records(vi_map, None)) == 2
     assert set(vi_map.resources.owner.tolist()) == {len(vi_map.missions) - 1}
+    shorter = remove_missions(vi_map, [len(vi_map.missions) - 1])
+    assert chronicle.records(shorter, None) == chronicle.records(vi_map, None)
+    assert set(shorter.resources.owner.tolist()) == {len(shorter.missions) - 1}
+    with pytest.raises(MapError, match="other commands changed the map"):
+        chronicle.map_at(shorter, None, "2020-10-20")
+    assert len(remove_missions(vi_map, [0, 1, 2]).resources) == 0
+
+
+def test_a_map_keeps_few_states_and_all_facts() -> None:
+    vi_map, report = updated()
+    vi_map = chronicle.stored_order(without_resources(vi_map, vi_map.resources.type >= 0))
+    states = {chronicle.checksum(vi_map): 0}
+    for number in range(1, 25):
+        line = dataclasses.replace(report.sessions[0], date=f"2021-01-{number:02d} 12:00")
+        after = chronicle.stored_order(remove_landmarks(vi_map, np.arange(3)))
+        numbered = dataclasses.replace(report, sessions=(line,))
+        vi_map = chronicle.with_record(vi_map, after, numbered)
+        states[chronicle.checksum(vi_map)] = number
+    known = chronicle.records(vi_map, None)
+    assert [fact.date[8:10] for r in known for fact in r.facts] == [
+        f"{n:02d}" for n in range(1, 25)
+    ]
+    assert len(known) == len([r for r in known if r.differences]) == 12
+    for day in (1, 7, 20, 23, 24):
+        then, update = chronicle.map_at(vi_map, None, f"2021-01-{day:02d} 24")
+        state = states[chronicle.checksum(then)]
+        if day == 24:
+            assert update is None
+            assert state == 24
+            continue
+        assert update is not None
+        assert state == int(update.date[8:10]) - 1
+        assert 0 <= day - state <= (0 if day >= 20 else 4)
+        facts = [fact for r in chronicle.records(then, None) for fact in r.facts]
+        assert len(facts) == state
+    # differences of states that other commands have left behind go
+    changed = chronicle.stored_order(remove_landmarks(vi_map, np.arange(3)))
+    after = chronicle.stored_order(remove_landmarks(changed, np.arange(3)))
+    later = chronicle.records(chronicle.with_record(changed, after, report), None)
+    assert [bool(record.differences) for record in later] == [False] * 12 + [True]
 
 
 def test_readers_of_the_original_layout_skip_what_updates_add(tmp_path: Path) -> None:
