@@ -6,6 +6,7 @@ names and published together: a command that fails or is cancelled leaves no fil
 """
 
 import dataclasses
+import os
 import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -119,16 +120,30 @@ def staging(*, enabled: bool = True) -> Iterator[StagedFiles]:
         _staged.reset(token)
 
 
+def check_creatable(path: Path) -> None:
+    """Refuse a file or folder that cannot be made, although folders above it are made.
+
+    Raises:
+        UserError: A folder above it is a file, or the user must not write into it.
+    """
+    above = next(folder for folder in path.absolute().parents if os.path.lexists(folder))
+    if not above.is_dir():
+        raise UserError(f"{path}: cannot be written ({above} is not a folder)")
+    if not os.access(above, os.W_OK | os.X_OK):
+        raise UserError(f"{path}: cannot be written (no permission to write into {above})")
+
+
 def check_writable(path: Path, *, overwrite: bool) -> None:
     """Refuse a file that exists, before any work is done.
 
     Raises:
-        UserError: The file exists and `overwrite` is not set, or it is a folder, a device, a socket
-            or a pipe.
+        UserError: The file exists and `overwrite` is not set, it is a folder, a device, a socket
+            or a pipe, or no file can be made there.
     """
     try:
         mode = path.stat().st_mode
     except FileNotFoundError:
+        check_creatable(path)
         return
     except OSError as error:
         raise UserError(f"{path}: cannot be written ({error.strerror})") from error

@@ -39,6 +39,7 @@ def map_values(session: Session) -> list[tuple[str, str]]:
     see_also=("generate_summary_map_and_save_to_disk", "landmark_sparsify"),
     writes_files=True,
     completes={"localization_map": map_values},
+    reads=("localization_map",),
 )
 def localize(
     context: CommandContext,

@@ -157,8 +157,8 @@ def command(
         completes: Values that the prompt proposes, by flag: "snapshot", "job", "alias", "map",
             "mission", "command", or a function of the session that returns pairs of a value and a
             note on it.
-        reads: Flags that name files or folders which must exist. A script is not started when one is
-            missing that no command before it can have made.
+        reads: Flags that name files or folders which must exist, or maps in memory. A script is not
+            started when one is missing that no command before it can have made.
 
     Raises:
         TypeError: The signature cannot be a command: a type that no flag can have, or the same

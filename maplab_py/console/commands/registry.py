@@ -6,13 +6,14 @@ import logging
 import os
 import re
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from importlib.metadata import Distribution, EntryPoint, entry_points
 from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 
 from maplab_py.console.commands.command import COMMAND_ATTRIBUTE, Command
+from maplab_py.console.commands.flag_index import Flags, Index, kept_index
 from maplab_py.console.commands.flags import CONSOLE_FLAGS, Flag
 from maplab_py.console.commands.suggest import unknown
 from maplab_py.errors import UserError
@@ -65,8 +66,9 @@ class Registry:
             name: entry for entry in self._pending.values() for name in _declared_names(entry)
         }
         self._lock = threading.RLock()
+        self._built_in = {n for n, e in self._pending.items() if e.value.startswith(BUILT_IN)}
         for entry in list(self._pending.values()):
-            if not entry.value.startswith(BUILT_IN):
+            if entry.name not in self._built_in:
                 self._load(entry)
 
     @property
@@ -120,12 +122,31 @@ class Registry:
 
     def flags_named(self, name: str) -> list[tuple[Command, Flag]]:
         """Return every command that has a flag of this name, with the flag."""
-        return [(c, c.flags[name]) for c in self.commands if name in c.flags]
+        for plugin in self._flag_index.get(name, ()):
+            if plugin in self._pending:
+                self._load(self._pending[plugin])
+        owners = {c.name: c for c in self._commands.values() if name in c.flags}
+        return [(owners[key], owners[key].flags[name]) for key in sorted(owners)]
 
-    def all_flags(self) -> dict[str, Flag]:
+    def all_flags(self) -> Mapping[str, Flag]:
         """Return one flag for every flag name of any command, and the console's own flags."""
-        flags = {name: flag for command in self.commands for name, flag in command.flags.items()}
-        return CONSOLE_FLAGS | flags
+        commands = [self._commands[name] for name in sorted(self._commands)]
+        loaded = {name: flag for command in commands for name, flag in command.flags.items()}
+        if not self._pending:
+            return CONSOLE_FLAGS | loaded
+        return Flags({*self._flag_index, *loaded}, lambda name: self.flags_named(name)[-1][1])
+
+    @functools.cached_property
+    def _flag_index(self) -> Index:
+        """Names of the built-in plugins of every flag; they are imported only where no index is kept."""
+        return kept_index([n for n in self._order if n in self._built_in], self._make_index)
+
+    def _make_index(self) -> Index:
+        index: dict[str, list[str]] = {}
+        for plugin in (plugin for plugin in self.plugins if plugin.name in self._built_in):
+            for name in {name: None for c in plugin.commands for name in c.flags}:
+                index.setdefault(name, []).append(plugin.name)
+        return index
 
     def add(self, command: Command, plugin: Plugin) -> None:
         """Register a command; a name that is in use stays with its first owner."""

@@ -1,24 +1,29 @@
 """Errors of a chain of commands that can be seen before anything of it runs."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
 from maplab_py.console.commands import flags, lines
 from maplab_py.console.scripts.aliases import expanded
 from maplab_py.console.session.call import Call, call_from_words
+from maplab_py.console.session.maps import key_of_folder
 from maplab_py.console.session.session import Session
 from maplab_py.console.session.settings import Layer
 from maplab_py.errors import UserError
+from maplab_py.output_files import check_creatable, check_writable
 
 LEAVE = ("q", "quit", "exit")
+_MAKERS_OF_ANY_KEY = ("recover",)
+"""Commands whose maps have keys that their lines do not name."""
 _MAX_DEPTH = 8
 
 
 def check_commands(text: str, session: Session, written: list[Path] | None = None) -> list[str]:
     """Return the errors of a text of commands, each with its place; nothing is run.
 
-    Names, flags, types, values that are missing, variables, and files and folders that a command reads and
-    that no command before it can have made.
+    Names, flags, types, values that are missing, variables, files, folders and maps that a command reads and
+    that no command before it can have made, and output files that exist or cannot be made.
 
     Args:
         text: The commands.
@@ -49,6 +54,8 @@ class _Checker:
         self._aliases = dict(session.aliases)
         self._settings = session.settings.copy()
         self._written = written
+        self._keys = set(session.maps.keys)  # of maps, and words that commands may make keys of
+        self._makes_any_key = False
         self._runs_shell = False  # a shell command can make any file
 
     def check(self, text: str, place: str = "", depth: int = 0) -> None:
@@ -95,14 +102,44 @@ class _Checker:
         return False
 
     def _check_files(self, call: Call) -> None:
-        for name in call.command.reads:
-            path = call.values.get(name)
-            if not isinstance(path, Path) or self._runs_shell:
-                continue
-            fault = _fault(path)
-            if fault and not any(_is_related(path, other) for other in self._written):
-                raise UserError(f"{call.command.name}: --{name}={path}: {fault}")
+        for name in () if self._runs_shell else call.command.reads:
+            value = call.values.get(name)
+            fault = self._missing(Path(value), is_key=isinstance(value, str)) if value else ""
+            if fault:
+                raise UserError(f"{call.command.name}: --{name}={value}: {fault}")
+        if not self._runs_shell:
+            self._check_output(call)
         self._written += [value for value in call.values.values() if isinstance(value, Path)]
+        texts = (*call.given.values(), *call.values.values(), call.command.name)
+        self._keys.update(part for text in texts for part in re.split(r"[/,=]", str(text)) if part)
+        self._makes_any_key |= call.command.name in _MAKERS_OF_ANY_KEY
+        self._makes_any_key |= not self._registry.is_built_in(call.command)
+
+    def _missing(self, path: Path, *, is_key: bool) -> str:
+        """Return why a file, or the map of a key, is not there; empty if it may be by then."""
+        fault, key = _fault(path), str(path)
+        if not fault or any(_is_related(path, other) for other in self._written):
+            return ""
+        if not is_key:
+            return fault
+        parents = [folder for folder in self._written if folder.is_dir()]
+        if (
+            self._makes_any_key
+            or any(key.startswith(key_of_folder(Path(known))) for known in self._keys)
+            or any(key == key_of_folder(child) for folder in parents for child in folder.iterdir())
+        ):
+            return ""
+        return "there is no such map, neither in memory nor on disk"
+
+    def _check_output(self, call: Call) -> None:
+        """Refuse an output file that exists already, or whose folder cannot be made."""
+        path = call.values.get(call.command.output)
+        if not isinstance(path, Path) or any(_is_related(path, other) for other in self._written):
+            return
+        if path.is_file() and "overwrite" in call.command.flags:
+            check_writable(path, overwrite=bool(call.values.get("overwrite")))
+        else:
+            check_creatable(path)
 
     def _follow(self, call: Call, words: Sequence[str]) -> None:
         """Do to the copies of the session's state what a command would do to it."""

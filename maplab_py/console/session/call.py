@@ -1,6 +1,7 @@
 """One call of a command: from words or keyword arguments to typed values with their origins."""
 
 import dataclasses
+from collections import ChainMap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -174,7 +175,7 @@ def _flagfile_texts(text: str, command: Command, registry: Registry) -> dict[str
         path = flag_types.expand_path(text)
     except ValueError as error:
         raise FlagError(f"--flagfile={text}: {error}") from None
-    known = {**registry.all_flags(), **command.flags}
+    known: Mapping[str, flags.Flag] = ChainMap(dict(command.flags), registry.all_flags())  # type: ignore[arg-type]
     texts: dict[str, str] = {}
     for line in flags.read_flagfile(path or Path()):
         try:

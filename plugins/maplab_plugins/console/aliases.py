@@ -159,12 +159,13 @@ def list_flags(context: CommandContext, filter_: str = "") -> SettingList | Mess
     """
     registry, current = context.session.registry, context.session.settings.current()
     wanted = filter_.lstrip("-").replace("-", "_")
-    names = [n for n in registry.all_flags() if wanted in n] if wanted else list(current)
+    every = registry.all_flags()
+    names = [n for n in every if wanted in n] if wanted else list(current)
     lines = []
     for name in sorted(names):
         owners = registry.flags_named(name)
         setting = current.get(name)
-        value = setting.text if setting else registry.all_flags()[name].default_text
+        value = setting.text if setting else every[name].default_text
         origin = setting.origin if setting else "default"
         lines.append(
             SettingLine(

@@ -70,7 +70,7 @@ def list_maps(context: CommandContext) -> MapList | Message:
     return MapList(context.maps.selected_key, lines)
 
 
-@command("select_map", "select", example="select_map v1_01", needs_map=False)
+@command("select_map", "select", example="select_map v1_01", needs_map=False, reads=("map_key",))
 def select_map(context: CommandContext, map_key: str) -> Message:
     """Make a map in memory the one that commands work on.
 
@@ -149,7 +149,12 @@ def copy_map(context: CommandContext, target_map_key: str) -> Message:
     return Message(f"copied map '{context.map_key}' to '{target_map_key}'")
 
 
-@command("merge_map", example="merge_map --map_key=v1_02", see_also=("join_all_maps",))
+@command(
+    "merge_map",
+    example="merge_map --map_key=v1_02",
+    see_also=("join_all_maps",),
+    reads=("map_key",),
+)
 def merge_map(
     context: CommandContext, map_key: str, *, assign_new_ids: bool = False
 ) -> MergeReport:

@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Literal
 
 from maplab_plugins.visualization.following import NAME, running_viewer, viewer_for_output
 from maplab_py.cancellation import current_token, lasting_effect
-from maplab_py.plugin import CommandContext, Message, Report, UserError, command
+from maplab_py.plugin import (
+    CommandContext,
+    Message,
+    Report,
+    UserError,
+    check_writable,
+    command,
+)
 
 if TYPE_CHECKING:
     from maplab_py.viewer.display.viewer import Viewer
@@ -61,7 +68,7 @@ def save_view(
         view: Where to look from; empty = as the newest open page does.
         overwrite: Replace a file that is there already.
     """
-    _check_target(file, overwrite=overwrite)
+    check_writable(file, overwrite=overwrite)
     for name, size in (("width_px", width_px), ("height_px", height_px)):
         if not 16 <= size <= 8192:
             raise UserError(f"--{name}={size}: must be 16 to 8192")
@@ -90,7 +97,7 @@ def export_view(context: CommandContext, *, file: Path, overwrite: bool = False)
         file: The file.
         overwrite: Replace a file that is there already.
     """
-    _check_target(file, overwrite=overwrite)
+    check_writable(file, overwrite=overwrite)
     with viewer_for_output(context) as viewer:
         return ExportedView(file, viewer.export(file) * 1e-6)
 
@@ -160,10 +167,3 @@ def keep(context: CommandContext, viewer: Viewer, duration_s: float = 0.0) -> No
                 break
             time.sleep(0.1)
     token.cancelled = False
-
-
-def _check_target(file: Path, *, overwrite: bool) -> None:
-    if file.exists() and not overwrite:
-        raise UserError(f"--file={file} exists; give another name or --overwrite")
-    if not file.absolute().parent.is_dir():
-        raise UserError(f"--file={file}: there is no such folder")

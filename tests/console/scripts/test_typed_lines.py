@@ -341,6 +341,11 @@ FAULTS = {
     "load $NO_SUCH_VARIABLE": "variable $NO_SUCH_VARIABLE is not set",
     "kfh word": "unexpected word 'word'",
     "optvi --flagfile=nosuch.flags": "nosuch.flags",
+    "optvi --flagfile=wrong.flags": "wrong.flags:1: optimize_visual_inertial has no flag --nosuch",
+    "set --nosuch=1": "no command has a flag --nosuch",
+    "save_view wrong.flags/sub/map.png": "wrong.flags/sub/map.png: cannot be written",
+    "save_view wrong.flags": "exists already: give --overwrite",
+    "localize --localization_map=none": "there is no such map, neither in memory nor on disk",
 }
 
 
@@ -351,6 +356,7 @@ def test_a_fault_anywhere_is_named_and_nothing_runs(
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     monkeypatch.chdir(tmp_path)
+    Path("wrong.flags").write_text("--nosuch=1")
     sound = ["create_new_map a", "map_stats"]
     sound.insert({"first": 0, "middle": 1, "last": 2}[place], fault)
     runner = Runner(Session(REGISTRY), ConsoleTerminal())
@@ -395,6 +401,10 @@ SOUND = [
     "help lc; lc --help",
     "simulate --map_folder=sim; load sim/session_1",
     "visualize; why $pick",
+    "create_new_map a; localize --localization_map=a; select_map a",
+    "load_all --maps_folder=.; select_map sub_1",
+    "split_map; rename_map whole; load_all .; select_map whole_cell_1; recover; merge_map other",
+    "save_view new/folder/map.png; save_view new/folder/map.png --overwrite",
 ]
 
 
@@ -405,6 +415,7 @@ def test_what_earlier_commands_make_is_there(
     monkeypatch.chdir(tmp_path)
     if text.startswith("set"):
         (tmp_path / "nosuch.csv").touch()
+    (tmp_path / "sub.1").mkdir()
     assert check_commands(text, session) == []
 
 
