@@ -39,6 +39,8 @@ class MapImages(Protocol):
         ...
 
 
+_LEAST_RADIUS_M = 0.02
+"""Radius that a map is drawn as if it had at least, before its device moves."""
 _OUTLINE_POINTS = 1500
 _FAR_M = 2000.0
 """Beyond this distance from the origin of G float32 would cost more than 0.1 mm."""
@@ -147,11 +149,13 @@ def make_drawing(vi_map: VIMap, options: VisualizationOptions) -> Drawing:
 def _extent(path: F64, landmarks: F64) -> Extent:
     """Return the extent of the path (N, 3) and of most landmarks (M, 3).
 
-    The outermost tenth of the landmarks does not count, nor one further away than the path is large.
+    The outermost tenth of the landmarks does not count, nor one much further away than the path is large
+    and than most landmarks are: a device that stands still sees a room around a path of no length.
     """
     low, high = path.min(axis=0), path.max(axis=0)
-    reach = max(float(np.linalg.norm(high - low)), 1.0)
-    near = landmarks[np.all(np.abs(landmarks - 0.5 * (low + high)) < 2.5 * reach, axis=1)]
+    away_m = np.abs(landmarks - 0.5 * (low + high)).max(axis=1)
+    usual_m = float(np.median(away_m)) if len(away_m) else 0.0
+    near = landmarks[away_m < 2.5 * max(float(np.linalg.norm(high - low)), usual_m, 1.0)]
     outline = path
     if len(near) >= 20:
         lowest, highest = np.percentile(near, [5.0, 95.0], axis=0)
@@ -159,7 +163,7 @@ def _extent(path: F64, landmarks: F64) -> Extent:
         low, high = np.minimum(low, lowest), np.maximum(high, highest)
         outline = np.concatenate([path, inner])
     outline = outline[spread_rows(outline, _OUTLINE_POINTS)]
-    radius = max(0.5 * float(np.linalg.norm(high - low)), 0.5)
+    radius = max(0.5 * float(np.linalg.norm(high - low)), _LEAST_RADIUS_M)
     return Extent(0.5 * (low + high), radius, float(low[2]), outline)
 
 

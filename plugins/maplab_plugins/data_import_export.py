@@ -138,7 +138,7 @@ def export_trajectory_to_csv(
     context: CommandContext,
     *,
     pose_export_file: Path | None = None,
-    csv_export_format: Literal["asl", "rpg"] = "asl",
+    csv_export_format: Literal["asl", "rpg", "tum"] = "asl",
     pose_export_reference_sensor_id: str = "",
     interpolate_to_imu_timestamps: bool = False,
     map_mission: str = "",
@@ -149,7 +149,7 @@ def export_trajectory_to_csv(
     Args:
         pose_export_file: File to write; by default a file in the map's folder.
         csv_export_format: asl = comma-separated poses in G and M, velocities and biases;
-            rpg = TUM, poses in G only.
+            rpg or tum = TUM, poses in G only.
         pose_export_reference_sensor_id: Sensor or camera whose poses are written; empty = IMU.
         interpolate_to_imu_timestamps: Write a state at every IMU sample, not only at vertices.
         map_mission: Mission id or unambiguous prefix; empty = all missions.

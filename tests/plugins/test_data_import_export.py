@@ -104,6 +104,7 @@ def test_trajectory_goes_to_the_map_folder_by_default(session: Session) -> None:
     assert np.max(np.abs(read.T_R_B - session.vi_map.T_G_I)) < 1e-15
     with pytest.raises(UserError, match="exists already"):
         session.run("ettc")
+    assert session.run("ettc", csv_export_format="tum", overwrite=True).files == report.files
 
 
 def test_trajectory_options(tmp_path: Path, session: Session) -> None:

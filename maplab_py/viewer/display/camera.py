@@ -1,5 +1,6 @@
 """The cameras of the viewer's pages."""
 
+from collections import deque
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,8 @@ Pages tell their size in pixels of the device, which differ; so only its form co
 Window = tuple[float, float, float]
 """Width by height of a page, and the parts of both that are free."""
 _WIDE: Window = (_ASPECT, _FREE, 1.0)
+_GIVEN = 64
+"""Views of late that pages were given."""
 _LEAST_SHARE, _ROOM = 0.5, 1.25
 """Share of the picture below which a map is moved closer to; room that a map gets to grow."""
 
@@ -85,7 +88,7 @@ def view_of(
 
 def _distance(p: F64, middle: F64, tangent: F64) -> float:
     """Return from how far points (N, 3), right, up and back, fit into the opening (2,)."""
-    return max(float((np.abs(p[:, :2] - middle) / tangent + p[:, 2:]).max()), 0.1)
+    return max(float((np.abs(p[:, :2] - middle) / tangent + p[:, 2:]).max()), 0.01)
 
 
 def _across(outline: F64) -> float:
@@ -119,7 +122,7 @@ class Cameras:
         """Start with a server that shows nothing yet."""
         self._server = server
         self._view = (np.array([0.0, -1.0, 1.0]), np.zeros(3))  # of new pages
-        self._given: dict[int, F64] = {}  # where a page's camera was put, by client
+        self._given: deque[tuple[F64, F64]] = deque([self._view], _GIVEN)
         self._extent: Extent | None = None
         self._room = 1.0
         server.on_client_connect(self._open)
@@ -132,22 +135,25 @@ class Cameras:
         """Move cameras, unless the user has, when the map outgrows their picture or is small in it."""
         if _LEAST_SHARE <= share_of_picture(extent, *self._view) <= 1.0:
             return
-        clients = self._server.get_clients()
-        unmoved = [client for key, client in clients.items() if self._is_unmoved(key, client)]
-        self._move(extent, unmoved, room=_ROOM)
+        clients = self._server.get_clients().values()
+        self._move(extent, [client for client in clients if self._is_unmoved(client)], room=_ROOM)
 
     def aim_new_pages(self, extent: Extent) -> None:
         """Let pages that will be opened look as those do that nobody has moved."""
         aim_initially(self._server.initial_camera, extent, self._view)
 
-    def _is_unmoved(self, key: int, client: Any) -> bool:
-        given = self._given.get(key, self._view[0])
-        off = np.linalg.norm(np.asarray(client.camera.position) - given)
-        return bool(off < 0.01 * np.linalg.norm(self._view[0] - self._view[1]))
+    def _is_unmoved(self, client: Any) -> bool:
+        """Tell whether a page looks from where it was put, or was put before: slow pages tell it late."""
+        position = np.asarray(client.camera.position)
+        return any(
+            np.linalg.norm(position - given) < 0.01 * np.linalg.norm(given - target)
+            for given, target in self._given
+        )
 
     def _move(self, extent: Extent, clients: list[Any], room: float) -> None:
         self._extent, self._room = extent, room
         self._view = view_of(extent, beside_panel=True, room=room)
+        self._given.append(self._view)
         self.aim_new_pages(extent)
         for client in clients:
             self._fit(client)
@@ -158,7 +164,7 @@ class Cameras:
 
         def fit_again(camera: Any) -> None:
             window = window_of(camera)
-            if abs(window[0] - form[0][0]) > 0.01 and self._is_unmoved(client.client_id, client):
+            if abs(window[0] - form[0][0]) > 0.01 and self._is_unmoved(client):
                 form[0] = window
                 self._fit(client)
 
@@ -177,7 +183,7 @@ class Cameras:
     def _show(self, client: Any, extent: Extent, view: tuple[F64, F64]) -> None:
         with client.atomic():
             _look(client.camera, extent, view)
-        self._given[client.client_id] = view[0]
+        self._given.append(view)
 
 
 def window_of(camera: Any) -> Window:

@@ -185,10 +185,14 @@ def _explain(context: CommandContext, words: tuple[str, ...]) -> CommandPage | M
 
 
 def _match(described: Command, word: str) -> int:
-    """Return how much a command has to do with a word: 8 by its name, down to 1 by its flags' help."""
+    """Return how much a command has to do with a word: 8 by its name, down to 1 by its flags' help.
+
+    A word that is a choice of a flag, such as the name of a format, counts as much as a part of the name.
+    """
+    choices = (flag.type.text.lower().split("|") for flag in described.flags.values())
     places = (
         (8, word in (name.lower() for name in described.names)),
-        (5, any(_has(name, word) for name in described.names)),
+        (5, any(_has(name, word) for name in described.names) or any(word in c for c in choices)),
         (4, _has(described.summary, word)),
         (2, _has(described.description, word) or any(_has(n, word) for n in described.flags)),
         (1, any(_has(_help_of(flag), word) for flag in described.flags.values())),

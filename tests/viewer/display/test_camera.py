@@ -69,6 +69,22 @@ def test_pages_follow_a_map_that_grows_until_they_are_moved() -> None:
     np.testing.assert_array_equal(pages[7].camera.position, pages[3].camera.position)
 
 
+def test_a_page_that_tells_late_where_it_was_put_is_not_moved() -> None:
+    pages = {3: page(3)}
+    server = SimpleNamespace(
+        initial_camera=SimpleNamespace(),
+        get_clients=lambda: pages,
+        on_client_connect=lambda _: None,
+    )
+    cameras = Cameras(server)
+    cameras.show_all(extent(1.0))
+    first = pages[3].camera.position.copy()
+    cameras.keep_in_view(extent(9.0))
+    pages[3].camera.position = first
+    cameras.keep_in_view(extent(30.0))
+    assert share_of_picture(extent(30.0), pages[3].camera.position, pages[3].camera.look_at) > 0.5
+
+
 @pytest.mark.parametrize(
     ("size_px", "right", "lower"),
     [((390, 844), 1.0, -0.16), ((800, 900), 0.15, -1.0), ((900, 700), 0.41, -1.0)],
