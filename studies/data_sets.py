@@ -8,7 +8,7 @@ from typing import Any
 from maplab_py.algorithms.self_calibration.estimation import problem
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
 from maplab_py.output_files import write_text
-from maplab_py.simulation.scenario import MotionOptions, Scenario, SessionOptions
+from maplab_py.simulation.scenario import MotionOptions, Scenario, SessionOptions, WorldOptions
 from maplab_py.simulation.simulate import SimulatedData, simulate
 from maplab_py.simulation.truth import true_map
 from maplab_py.vimap import VIMap
@@ -47,7 +47,12 @@ def data_set(scenario: Scenario, number: int) -> SimulatedData:
 
 
 def evaluation_session(scenario: Scenario) -> SimulatedData:
-    """Simulate the session that evaluates calibrations: 0.5 m/s and 40 deg/s, as in Schneider 2019."""
+    """Simulate the session that evaluates calibrations: 0.5 m/s and 40 deg/s, as in Schneider 2019.
+
+    It is in a room; for scenarios without rooms in that of Schneider's motion capture.
+    """
+    room = WorldOptions(room_size_m=(9.0, 7.0, 3.0), landmarks_per_room=4000)
+    world = scenario.world if scenario.world.layout == "rooms" else room
     phases = tuple(
         MotionOptions(
             kind=kind,
@@ -62,7 +67,8 @@ def evaluation_session(scenario: Scenario) -> SimulatedData:
     )
     seeds = dataclasses.replace(scenario.seeds, motion=9, measurement=9, appearance=9)
     sessions = (SessionOptions(phases=phases),)
-    return simulate(dataclasses.replace(scenario, seeds=seeds, sessions=sessions))
+    evaluated = dataclasses.replace(scenario, seeds=seeds, sessions=sessions, world=world)
+    return simulate(evaluated)
 
 
 def with_noise(

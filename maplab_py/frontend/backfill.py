@@ -211,6 +211,11 @@ class Backfiller:
         """Whether frames are being read backwards."""
         return self._reading is not None
 
+    @property
+    def is_idle(self) -> bool:
+        """Whether the scale is known, and no frames are read backwards."""
+        return self._reading is None and self._scale_check_ns is None
+
     def reset(self) -> None:
         """Forget the frames, for a new start."""
         self.waiting, self._reading = WaitingFrames(), None

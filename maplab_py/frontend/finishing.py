@@ -106,8 +106,9 @@ def finish(
             raise
         problems.append(f"{error} (the map is in memory as '{map_key}': save it)")
     odometry, first_ns = mapping.odometry, mapping.statistics.first_ns
-    since_s = None if odometry.trusted_ns is None else (odometry.trusted_ns - first_ns) * 1e-9
-    notes += scale_verdict(odometry.scale_sigma, since_s, doubts)
+    scale_sigma, since_ns = odometry.scale_knowledge
+    since_s = None if since_ns is None else (since_ns - first_ns) * 1e-9
+    notes += scale_verdict(scale_sigma, since_s, doubts)
     report = _report(mapping, recording_name, vi_map, notes, "; ".join(problems))
     report = dataclasses.replace(report, map_key=map_key, map_folder=saved_folder)
     return FinishedRun(report, vi_map, disk_copy)

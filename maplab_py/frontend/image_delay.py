@@ -29,12 +29,16 @@ class DelayMonitor:
 
     def __init__(self, device: RecordedSensors) -> None:
         """Begin without a measurement."""
+        self.recalibrate(device)
+        self._mean_s, self._variance = 0.0, _PRIOR_SIGMA_S**2
+        self.applied_s = 0.0
+
+    def recalibrate(self, device: RecordedSensors) -> None:
+        """Forget the frames, and measure with another calibration from now on."""
         assert device.imu is not None
         self._imu = device.imu
         self._rays = rays.RayMaker(device.cameras, device.T_I_C)
-        self._history = History(_SPAN_S + 1e-3)
-        self._mean_s, self._variance = 0.0, _PRIOR_SIGMA_S**2
-        self.applied_s = 0.0
+        self.reset()
 
     @property
     def delay_s(self) -> float:

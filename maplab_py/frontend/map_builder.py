@@ -51,6 +51,7 @@ class MapBuilder:
         if self._options.save_image_as_resources:
             self._images = NewResources(staging_parent, seed=seed)
         self._missions: list[RecordedMission] = []
+        self._devices: list[RecordedSensors] = []  # of the missions
         self._waiting: dict[int, tuple[VertexFrames, list[int]]] = {}
 
     @property
@@ -67,14 +68,16 @@ class MapBuilder:
         """Begin a mission: the next vertex is its root.
 
         Args:
-            device: The sensors with other figures of noise; None = as before.
+            device: The sensors with other figures; None = as before. With another calibration they need
+                other ids, so that both are in the map.
         """
         self._device = device or self._device
         self._missions.append(RecordedMission())
+        self._devices.append(self._device)
 
     def calibrate(self, device: RecordedSensors) -> None:
         """Take the sensors with another calibration, for all missions."""
-        self._device = device
+        self._device, self._devices = device, [device] * len(self._missions)
 
     def add_imu(self, times_ns: I64, accel_gyro: F64) -> None:
         """Add the samples (S, 6) between two frames, those at the times of both included.
@@ -201,13 +204,14 @@ class MapBuilder:
             EstimationError: No mission has two vertices.
         """
         missions = self._used_missions()
+        devices = [self._devices[self._missions.index(mission)] for mission in missions]
         if not missions:
             raise EstimationError(
                 "there is no map: the odometry has estimated fewer than two vertices"
             )
-        result = mission_map(self._device, missions[0], self._images)
-        for mission, tie in zip(missions[1:], self.ties()[1:], strict=True):
-            part = mission_map(self._device, mission, self._images)
+        result = mission_map(devices[0], missions[0], self._images)
+        for mission, device, tie in zip(missions[1:], devices[1:], self.ties()[1:], strict=True):
+            part = mission_map(device, mission, self._images)
             result = merge.stack(result, part) if tie is None else tied(result, part, tie)
         return result
 
@@ -219,7 +223,7 @@ class MapBuilder:
         part = self._missions[mission].part(first)
         if len(part) < _MIN_VERTICES:
             return None
-        vi_map = mission_map(self._device, part, self._images)
+        vi_map = mission_map(self._devices[mission], part, self._images)
         return init_tracks(vi_map, LandmarkQualityOptions(), across_cameras=True)[0]
 
     def recorded(self, mission: int) -> RecordedMission:

@@ -164,6 +164,12 @@ class Mapping:
         if self.builder is not None:
             self.builder.calibrate(self.odometry.device.with_cameras(*estimate.cameras()))
 
+    def recalibrate(self, device: protocol.RecordedSensors) -> None:
+        """Go on with another calibration, of sensors with other ids; see `Odometry.recalibrate`."""
+        if self.builder is not None:
+            self.builder.refine(self.odometry.window_states())
+        self.odometry.recalibrate(device)
+
     @property
     def recording_notes(self) -> tuple[str, ...]:
         """Notes of the reader of the recording."""

@@ -93,9 +93,8 @@ class Odometry:
         self.notes: list[str] = []  # what is wrong with the calibration
         self._noise_is_open = make_starter is None and self.options.imu_noise == "auto"
         self._delay_ns = 0  # that frames have in addition to the calibrated offset
-        self._calibration = WindowCalibration.of(
-            device.cameras, device.T_I_C, self.options.window_states
-        )
+        states = self.options.window_states
+        self._calibration = WindowCalibration.of(device.cameras, device.T_I_C, states)
         self.calibration_estimate: CalibrationEstimate | None = None
         self._backfiller = Backfiller(self._backward_smoother, is_wanted=self.options.backfill)
         self._starter: starting.Starter = self._make_starter(device)
@@ -151,14 +150,30 @@ class Odometry:
         return self._delays
 
     @property
-    def trusted_ns(self) -> int | None:
-        """Time since when the scale of this mission is known; None while it is not."""
-        return self._backfiller.trusted_ns
+    def scale_knowledge(self) -> tuple[float, int | None]:
+        """Deviation of this mission's scale when it was looked at last; time since when it is known."""
+        return self._backfiller.scale_sigma, self._backfiller.trusted_ns
 
     @property
-    def scale_sigma(self) -> float:
-        """Standard deviation of the scale, as a share of it, when it was looked at last."""
-        return self._backfiller.scale_sigma
+    def can_recalibrate(self) -> bool:
+        """Whether the estimate is sure enough for another calibration."""
+        is_plain = self._map_rule is None and not len(self._calibration)
+        return self._smoother is not None and is_plain and self._backfiller.is_idle
+
+    def recalibrate(self, device: RecordedSensors) -> None:
+        """If `can_recalibrate`, go on with another calibration, as a new mission in the same frame M."""
+        assert device.imu is not None and self._smoother is not None  # noqa: PT018
+        self._device, self._imu = device, device.imu
+        rig = device.cameras, device.T_I_C
+        self._focal_px = min(views.focal_length_px(camera) for camera in device.cameras)
+        self._calibration = WindowCalibration.of(*rig)
+        self._tracker.recalibrate(*rig)
+        self.watch.recalibrate(device, self._imu)
+        if self._delays is not None:
+            self._delays.recalibrate(device)
+        self._smoother.recalibrate(*rig, self._imu)
+        self._gyro_bias, self._newest_turn = self._smoother.states.gyro_bias[-1], None
+        self.counts.starts += 1
 
     def finish_backfill(self) -> Backfill | None:
         """Read the frames before the start to their end; None when there are none left."""
@@ -166,9 +181,8 @@ class Odometry:
 
     def landmarks(self) -> tuple[I64, F64]:
         """Return track ids (L,) and places (L, 3) in M of the landmarks in the window."""
-        if self._smoother is None:
-            return np.zeros(0, dtype=np.int64), np.zeros((0, 3))
-        return self._smoother.landmarks()
+        nothing = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
+        return nothing if self._smoother is None else self._smoother.landmarks()
 
     def window_states(self) -> NavState:
         """Return the present estimates of the frames in the window."""
@@ -199,7 +213,7 @@ class Odometry:
     def _process_waiting(self) -> list[OdometryUpdate]:
         updates = []
         while self._waiting and self._buffer.covers(
-            self._waiting[0].time_ns + self._longest_delay_ns
+            self._waiting[0].time_ns + max(self._delay_ns, self._wanted_delay_ns)
         ):
             frame_set = self._waiting.popleft()
             first_ns = self._buffer.first_ns
@@ -212,10 +226,6 @@ class Odometry:
     @property
     def _wanted_delay_ns(self) -> int:
         return 0 if self._delays is None else round(self._delays.applied_s * 1e9)
-
-    @property
-    def _longest_delay_ns(self) -> int:
-        return max(self._delay_ns, self._wanted_delay_ns)
 
     def _apply_delay(self) -> None:
         """Change the delay of frames: at once before the start, in small steps after it."""

@@ -55,6 +55,10 @@ class RecordedSensors:
         known = dataclasses.replace(self.sensors, sensors={**self.sensors.sensors, rig.id: rig})
         return dataclasses.replace(self, sensors=known)
 
+    def renamed(self) -> RecordedSensors:
+        """Return the same sensors under ids that follow from their calibration."""
+        return make_device(self.cameras, self.T_I_C, self.imu, self.notes)
+
     def with_imu(self, imu: Imu) -> RecordedSensors:
         """Return the same sensors with other figures of the IMU."""
         known = dataclasses.replace(self.sensors, sensors={**self.sensors.sensors, imu.id: imu})

@@ -13,17 +13,18 @@ from datetime import UTC, datetime
 import numpy as np
 
 from maplab_py.algorithms.recording_check.mending import RecalibratedRecording
+from maplab_py.algorithms.self_calibration.reports import SelfCalibrationReport
 from maplab_py.algorithms.self_calibration.segments.database import read_calibration
 from maplab_py.child_processes import Service, ServiceEnded
 from maplab_py.errors import Cancelled
 from maplab_py.frontend.mapping import Mapping
 from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.frontend.recorded_mission import RecordedMission
-from maplab_py.interop.recordings.protocol import Recording, TrackedFrame
+from maplab_py.interop.recordings.protocol import RecordedSensors, Recording, TrackedFrame
 from maplab_py.online_calibration.options import OnlineCalibrationOptions
 from maplab_py.online_calibration.process import OPTIONS, Finish, Opening, Piece, Status, words
 from maplab_py.progress import Progress
-from maplab_py.sensors import calibration_transfer
+from maplab_py.sensors import SensorSet, calibration_transfer
 
 _MODULE = "maplab_py.online_calibration.child"
 _SIGNIFICANT_SIGMAS = 3.0
@@ -42,12 +43,16 @@ class CalibrationBeside:
         self._mapping: Mapping | None = None
         self._mission, self._begin_ns, self._session = -1, 0, ""
         self._worker: _Worker | None = None
+        self._device: RecordedSensors | None = None  # as segments are recorded now
+        self._switches: list[str] = []
 
     def after_frame(self, update: OdometryUpdate, mapping: Mapping) -> None:
         """Hand a segment on when one is complete."""
         if mapping is not self._mapping:  # the first run, or the same recording once more
             self.close()
-            self._mapping, self._mission = mapping, -1
+            self._mapping, self._mission, self._device = mapping, -1, None
+        if self._options.apply == "now":
+            self._switch(update, mapping)
         builder = mapping.builder
         if builder is None or update.released is None or not len(update.released):
             return
@@ -78,10 +83,28 @@ class CalibrationBeside:
             self._begin_ns = int(part.states[-1].time_ns[0])
             return
         if self._worker is None:
-            opening = Opening(self._options, self._mapping.odometry.device)
+            self._device = self._mapping.odometry.device
+            opening = Opening(self._options, self._device)
             self._worker = _Worker(opening, self._options.processor_share)
         self._worker.put(Piece(self._session, part))
         self._begin_ns = int(part.states[-1].time_ns[0])
+
+    def _switch(self, update: OdometryUpdate, mapping: Mapping) -> None:
+        """Go on with a proposed calibration once the odometry is at a keyframe and sure enough."""
+        worker, window = self._worker, update.window
+        if worker is None or worker.is_opening or worker.newest.proposal is None:
+            return
+        if window is None or not window.is_keyframe or not mapping.odometry.can_recalibrate:
+            return
+        assert self._device is not None
+        self._device = _calibrated(self._device, read_calibration(self._options.proposal))
+        mapping.recalibrate(self._device.renamed())
+        reason = contradicted(worker.newest) or "the calibration was not known as well as wanted"
+        self._switches.append(
+            f"{reason}; a new mission with another calibration since "
+            f"{mapping.statistics.elapsed_s:.1f} s: {_changed(worker.newest.proposal)}"
+        )
+        worker.open_again(Opening(self._options, self._device))
 
     @property
     def evaluation(self) -> Status:
@@ -95,19 +118,12 @@ class CalibrationBeside:
             UserError: The file is damaged, or of other cameras.
         """
         options, of_recording = self._options, recording.device
-        if options.apply != "next_start" or not options.proposal.is_file():
+        if not options.applies_later or not options.proposal.is_file():
             return recording
         known = read_calibration(options.proposal)
-        device = calibration_transfer.Device(of_recording.imu_id, of_recording.rig_id)
-        sensors = calibration_transfer.with_calibration_of(
-            of_recording.sensors,
-            device,
-            known,
-            calibration_transfer.corresponding_device(known, device),
-        )
         return RecalibratedRecording(
             recording,
-            dataclasses.replace(of_recording, sensors=sensors),
+            _calibrated(of_recording, known),
             "read with the calibration that --self_calibrate has found",
         )
 
@@ -130,6 +146,7 @@ class CalibrationBeside:
             if recorded.last_ns is not None:
                 self._cut(recorded, recorded.last_ns, OPTIONS.segment_keyframes // 2 + 1)
         notes = mapping.statistics.notes
+        notes += self._switches
         if self._worker is None:
             notes.append("self-calibration: no segment of the recording is long enough")
             return
@@ -149,12 +166,18 @@ class _Worker:
     def __init__(self, opening: Opening, share: float) -> None:
         self.newest = Status()
         self._opening, self._share = opening, share
-        self._requests: queue.SimpleQueue[Piece | Finish | None] = queue.SimpleQueue()
+        self._requests: queue.SimpleQueue[Opening | Piece | Finish | None] = queue.SimpleQueue()
         self._service: Service | None = None
         self._starts, self._is_closed = 0, False
+        self.is_opening, self._before = False, 0  # segments before it was opened again
         self._hurry = threading.Event()
         self._thread = threading.Thread(target=self._work, name="self-calibration", daemon=True)
         self._thread.start()
+
+    def open_again(self, opening: Opening) -> None:
+        """Begin anew with another calibration of the device, after the requests so far; do not wait."""
+        self._opening, self.is_opening = opening, True
+        self._requests.put(opening)
 
     def put(self, request: Piece) -> None:
         """Have a segment evaluated; do not wait."""
@@ -167,7 +190,7 @@ class _Worker:
         self._hurry.set()
         while self._thread.is_alive() and not is_to_end():
             self._thread.join(0.1)
-        return self.newest
+        return dataclasses.replace(self.newest, evaluated=self._before + self.newest.evaluated)
 
     def close(self) -> None:
         """End thread and process."""
@@ -189,7 +212,7 @@ class _Worker:
             if self._service is not None:
                 self._service.end()
 
-    def _ask(self, request: Piece | Finish) -> None:
+    def _ask(self, request: Opening | Piece | Finish) -> None:
         """Ask the process; one that has died is started again, and the request is not repeated."""
         try:
             if self._service is None:
@@ -198,13 +221,27 @@ class _Worker:
                 self._starts += 1
                 self._service = Service(_MODULE)
                 self.newest = self._service.ask(self._opening, lambda: self._is_closed)
+            self._before += self.newest.evaluated if isinstance(request, Opening) else 0
             self.newest = self._service.ask(request, lambda: self._is_closed)
+            self.is_opening &= request is not self._opening
         except Cancelled:
             self._service = None
         except (ServiceEnded, OSError) as error:
             self._service = None
             problem = f"the process beside the odometry has {error}"
             self.newest = dataclasses.replace(self.newest, problem=problem, processor_s=0.0)
+
+
+def _calibrated(device: RecordedSensors, known: SensorSet) -> RecordedSensors:
+    """Return a device with a calibration that has been written.
+
+    Raises:
+        UserError: It is of other cameras.
+    """
+    ids = calibration_transfer.Device(device.imu_id, device.rig_id)
+    source = calibration_transfer.corresponding_device(known, ids)
+    sensors = calibration_transfer.with_calibration_of(device.sensors, ids, known, source)
+    return dataclasses.replace(device, sensors=sensors)
 
 
 def _without_descriptors(recorded: RecordedMission) -> RecordedMission:
@@ -235,6 +272,12 @@ def contradicted(status: Status) -> str:
     )
 
 
+def _changed(proposal: SelfCalibrationReport) -> str:
+    """Return what has changed significantly, in words."""
+    estimates = proposal.parameters
+    return "; ".join(words(e) for e in estimates if abs(e.change_in_sigmas) > _SIGNIFICANT_SIGMAS)
+
+
 def _notes(status: Status, options: OnlineCalibrationOptions) -> Iterator[str]:
     yield (
         f"self-calibration: {status.evaluated} segments evaluated, {status.kept} in "
@@ -245,16 +288,11 @@ def _notes(status: Status, options: OnlineCalibrationOptions) -> Iterator[str]:
     if status.problem:
         yield f"self-calibration: {status.problem}"
     if status.proposal is not None:
-        changed = [
-            words(each)
-            for each in status.proposal.parameters
-            if abs(each.change_in_sigmas) > _SIGNIFICANT_SIGMAS
-        ]
         use = (
             "the next run with --self_calibrate begins with it"
-            if options.apply == "next_start"
+            if options.applies_later
             else "apply_calibration or --sc_apply=next_start uses it"
         )
-        yield f"proposed calibration in {options.proposal} ({use}): {'; '.join(changed)}"
+        yield f"proposed calibration in {options.proposal} ({use}): {_changed(status.proposal)}"
         for name in status.proposal.unobservable:
             yield f"not observable, as it was: {name}"

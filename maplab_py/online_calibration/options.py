@@ -50,9 +50,9 @@ class OnlineCalibrationOptions(Options, prefix="sc_"):
     a new one is due; needs --sc_database"""
     database: Path | None = None
     """Segment database of the device, made if missing; proposed calibrations are written beside it"""
-    apply: str = option("propose", choices=("propose", "next_start"))
+    apply: str = option("propose", choices=("propose", "next_start", "now"))
     """Use of a new calibration: propose = write it beside the database, next_start = also begin the next run
-    with it"""
+    with it, now = also go on with it at a keyframe, as a new mission"""
     processor_share: float = option(0.25, gt=0, le=1)
     """Largest share of one processor core for the evaluation of segments while the odometry runs"""
     wanted: WantedSigmas = WantedSigmas()
@@ -69,6 +69,11 @@ class OnlineCalibrationOptions(Options, prefix="sc_"):
         if not self.is_on and (self.database is not None or self.apply != "propose"):
             flag = "sc_apply" if self.database is None else "sc_database"
             raise FlagError(f"--{flag} needs --self_calibrate")
+
+    @property
+    def applies_later(self) -> bool:
+        """Whether the next run begins with a proposal."""
+        return self.apply != "propose"
 
     @property
     def proposal(self) -> Path:

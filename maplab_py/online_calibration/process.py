@@ -47,6 +47,8 @@ _SEGMENTS_AT_ONCE = 5
 """Segments after which the database is written; fewer at the end. A crash loses those since."""
 _MAX_CAMERA_SHIFT_M = 0.025
 _MAX_SUGGESTED = 12
+_CLEAR_SIGMAS = 15.0
+"""A running odometry goes on with a calibration that is so much better than the one it has."""
 _REDO_SHARE = 0.5
 """Without a contradiction, calibrate when this share of the database is newer than the last calibration."""
 
@@ -241,9 +243,11 @@ class DeviceCalibration:
         return [each for each in covariances if len(each) == len(self._parameters)]
 
     def _is_contradiction_understood(self) -> bool:
-        """Return whether the new value of what is contradicted is known as well as wanted."""
+        """Return whether what is contradicted is known as well as wanted, or much better than before."""
         if self._contradiction is None:
             return False
+        if self._options.apply == "now" and self._contradiction.sigmas >= _CLEAR_SIGMAS:
+            return True
         rows = changes.families(self._parameters)[self._contradiction.family]
         sigma = np.sqrt(np.diag(self._covariance()))
         return bool(np.all(sigma[rows] <= self._tolerance[rows]))
@@ -306,7 +310,7 @@ class DeviceCalibration:
         write_proposal(self._options, calibrated, report)
         self._proposal = report
         self._calibrated = frozenset(record.key for record in database.records)
-        if self._options.apply == "next_start" and len(valid) < len(database):
+        if self._options.applies_later and len(valid) < len(database):
             self._drop(database, valid)
 
     def _valid_segments(self, database: SegmentDatabase) -> SegmentDatabase:

@@ -174,6 +174,15 @@ def _calibration_beside(
         return None
     if not run.output.run_map_builder:
         raise UserError("--self_calibrate needs a map: leave --rovioli_run_map_builder=false out")
+    localization = run.localization
+    if options.apply == "now" and (
+        run.odometry.window_states or (localization.map_folder and localization.mode == "vil")
+    ):
+        raise UserError(
+            "--sc_apply=now cannot be combined with a calibration that the window estimates "
+            "(--vio_estimate) or with localisation in it (--vio_localization_mode=vil): use "
+            "--sc_apply=next_start, or another mode"
+        )
     return CalibrationBeside(options)
 
 

@@ -4,14 +4,23 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
+import pytest
+from maplab_plugins.rovioli import _calibration_beside
 
 from maplab_py.algorithms.self_calibration.segments.database import load_database
+from maplab_py.errors import UserError
+from maplab_py.frontend.localization.options import OnlineLocalizationOptions
 from maplab_py.frontend.mapping import Mapping
+from maplab_py.frontend.odometry_options import OdometryOptions
+from maplab_py.frontend.odometry_update import OdometryUpdate
+from maplab_py.frontend.run_options import RunOptions
 from maplab_py.interop.recordings.map_replay import MapRecording
 from maplab_py.online_calibration.beside import CalibrationBeside
 from maplab_py.online_calibration.options import OnlineCalibrationOptions
 from maplab_py.progress import SILENT
 from maplab_py.sensors.sensors_yaml import write_sensors
+from maplab_py.vimap import to_hex
+from maplab_py.vimap.tables import MissionSensor
 from tests.frontend.known_start import KnownStart
 from tests.frontend.simulated import replayed
 
@@ -45,3 +54,46 @@ def test_the_next_run_begins_with_a_proposal_only_if_it_shall(tmp_path: Path) ->
     again = used.recalibrated(recording)
     np.testing.assert_allclose(again.device.cameras[0].intrinsics, camera.intrinsics)
     assert len(list(again.items())) == len(list(recording.items()))
+
+
+def test_a_run_goes_on_with_another_calibration_as_a_new_mission() -> None:
+    vi_map, truth = replayed(cameras=1)
+    recording = MapRecording(vi_map, 0)
+    camera = recording.device.cameras[0]
+    camera = dataclasses.replace(camera, intrinsics=camera.intrinsics + 0.5)
+    other = recording.device.with_cameras((camera,), recording.device.T_I_C).renamed()
+
+    class Switch:
+        def after_frame(self, update: OdometryUpdate, mapping: Mapping) -> None:
+            if mapping.statistics.frames == 40:
+                assert mapping.odometry.can_recalibrate
+                mapping.recalibrate(other)
+
+    start = KnownStart(truth, with_biases=True)
+    mapping = Mapping(recording, observer=Switch(), make_starter=start)
+    mapping.run()
+    assert mapping.builder is not None
+    result, _ = mapping.builder.finish()
+    count = np.bincount(result.vertices.mission)
+    assert len(count) == 2
+    assert count.sum() == len(vi_map.vertices)
+    rigs = result.missions.sensor_id[:, int(MissionSensor.NCAMERA)]
+    used = [result.sensors.camera_rig(to_hex(rig)).cameras[0].intrinsics for rig in rigs]
+    np.testing.assert_allclose(used[1], used[0] + 0.5)
+    # the second mission begins where the first one ends
+    p_G = result.T_G_I[:, 4:]
+    error = p_G - truth.T_R_B[:, 4:]
+    assert np.linalg.norm(np.diff(error, axis=0), axis=1).max() < 0.02
+
+
+@pytest.mark.parametrize(("estimate", "folder"), [("intrinsics", None), ("none", Path("map"))])
+def test_switching_is_refused_where_the_window_has_more_states(
+    estimate: str, folder: Path | None
+) -> None:
+    options = OnlineCalibrationOptions(is_on=True, database=Path("device.segments"), apply="now")
+    run = RunOptions(
+        odometry=OdometryOptions(estimate=estimate),
+        localization=OnlineLocalizationOptions(map_folder=folder),
+    )
+    with pytest.raises(UserError, match="--sc_apply=now cannot be combined"):
+        _calibration_beside(run, options)

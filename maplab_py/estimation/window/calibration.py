@@ -11,11 +11,10 @@ from functools import cached_property
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I32, I64
 from maplab_py.estimation.codegen.kernels import CAMERA_DELAY_COLUMN, CAMERA_INTRINSICS_COLUMN
 from maplab_py.estimation.kernels.window_arguments import WindowCameras
 from maplab_py.estimation.terms.cameras import Cameras
-from maplab_py.estimation.window.frame import WindowFrame
 from maplab_py.estimation.window.states import WindowStates
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Camera
@@ -174,20 +173,28 @@ class WindowCalibration:
         return dataclasses.replace(WindowCalibration.of(*self.calibrated(values)), direction=-1.0)
 
     def rays_at_frame(
-        self, frame: WindowFrame, rays_C: F64, now: WindowCameras, rate_I: F64
+        self,
+        camera: I32,
+        uv_px: F64,
+        delay_s: F64,
+        rays_C: F64,
+        now: WindowCameras,
+        rate_I: F64,
     ) -> F64:
         """Return rays (N, 3) as their cameras would have seen them at the frame's time.
 
         Only the turn is considered.
 
         Args:
-            frame: The frame that sees them.
+            camera: Rows (N,) of the cameras.
+            uv_px: Pixels (N, 2).
+            delay_s: Of the frames (N,).
             rays_C: As seen.
             now: The cameras.
-            rate_I: Angular velocity (3,) of the body.
+            rate_I: Angular velocities (N, 3) of the body.
         """
-        timing_s, q_I_C = now.timing_s[frame.camera], now.T_I_C[frame.camera, :4]
-        late_s = timing_s[:, 0] + timing_s[:, 1] * frame.uv_px[:, 1] - frame.delay_s
+        timing_s, q_I_C = now.timing_s[camera], now.T_I_C[camera, :4]
+        late_s = timing_s[:, 0] + timing_s[:, 1] * uv_px[:, 1] - delay_s
         turn = so3.exp(late_s[:, None] * rate_I)
         return so3.rotate(so3.inverse(q_I_C), so3.rotate(turn, so3.rotate(q_I_C, rays_C)))
 

@@ -40,14 +40,8 @@ class InertialChain:
 
     def __init__(self, kernel: ModuleType, imu: Imu) -> None:
         """Begin without edges; the kernel is that of the residual `inertial`."""
-        self._kernel, self._imu = kernel, imu
-        imus = tuple(_with_failed(imu, ImuPart(parts)) for parts in range(4))
-        self._imus = InertialData(
-            np.zeros(1, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros((0, 6)), imus,
-            np.zeros(0, dtype=np.int64),
-        )  # fmt: skip
-        self._walk_density = np.sqrt(self._imus.walk_variance_density)
-        self._g_M = np.array([0.0, 0.0, -imu.gravity_magnitude_mps2])
+        self._kernel = kernel
+        self.take_imu(imu)
         self._samples: Samples = []
         self._arguments, self._whitening = np.zeros((0, _MEASURED)), np.zeros((0, 9, 9))
         self._integrated_at, self._seen_at = np.zeros((0, 6)), np.zeros((0, 6))
@@ -56,6 +50,31 @@ class InertialChain:
         self.is_open: Mask = np.zeros(0, dtype=np.bool_)
         self._is_stale: Mask = np.zeros(0, dtype=np.bool_)
         self._failed: I64 = np.zeros(0, dtype=np.int64)  # `ImuPart` of every edge
+
+    def take_imu(self, imu: Imu) -> None:
+        """Read samples as those of an IMU; edges stay as they are integrated."""
+        imus = tuple(_with_failed(imu, ImuPart(parts)) for parts in range(4))
+        self._imus = InertialData(
+            np.zeros(1, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros((0, 6)), imus,
+            np.zeros(0, dtype=np.int64),
+        )  # fmt: skip
+        self._walk_density = np.sqrt(self._imus.walk_variance_density)
+        self._g_M = np.array([0.0, 0.0, -imu.gravity_magnitude_mps2])
+
+    @property
+    def corrections(self) -> F64:
+        """Matrices (2, 3, 3) that correct scale and misalignment of gyroscope and accelerometer."""
+        return np.stack([of_kind[0] for of_kind in self._imus.corrections])
+
+    def mean_samples(self) -> F64:
+        """Return the mean (2, 3) of the samples of gyroscope and accelerometer; zeros without edges."""
+        samples = [values for _, values in self._samples] or [np.zeros((1, 6))]
+        return np.concatenate(samples).mean(axis=0).reshape(2, 3)[::-1]
+
+    def integrate_again(self, motion: F64) -> None:
+        """Integrate all edges with the present IMU and the biases in the motion (F, 9) of the frames."""
+        self._integrated_at, self._is_stale = motion[: len(self), 3:].copy(), ~self.is_open
+        self._integrate_stale()
 
     def __len__(self) -> int:
         return len(self._samples)

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I32, I64, Mask
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.codegen.kernels import residual_kernel, window_kernels
 from maplab_py.estimation.kernels.window_arguments import WindowPoint
@@ -35,6 +35,7 @@ from maplab_py.estimation.window.map_terms import MapTerms
 from maplab_py.estimation.window.options import WindowOptions
 from maplab_py.estimation.window.prior import WindowPrior
 from maplab_py.estimation.window.problem import WindowProblem
+from maplab_py.estimation.window.recalibration import WindowChange
 from maplab_py.estimation.window.states import WindowStates
 from maplab_py.estimation.window.tracks import Observations, Tracks
 from maplab_py.progress import SILENT
@@ -160,6 +161,20 @@ class FixedLagSmoother:
         """Give next to no weight to the samples of failed parts of the IMU since a time."""
         self._chain.doubt(since_ns, parts)
 
+    def recalibrate(self, cameras: tuple[Camera, ...], T_I_C: F64, imu: Imu) -> None:
+        """Express the window with another calibration, of which nothing is estimated; see `WindowChange`."""
+        before = self._cameras, self._chain.corrections
+        self.calibration = WindowCalibration.of(cameras, T_I_C)
+        self._cameras = self.calibration.of_kernels(self.calibration.mean)
+        self._back_projection = BackProjection(self._kernels, self.calibration)
+        self._chain.take_imu(imu)
+        change = WindowChange.between(before, (self._cameras, self._chain.corrections))
+        window = self._states, self._frames.rate_I, self._chain.mean_samples()
+        self._prior, self._states = change.prior(self._prior, *window), change.states(*window)
+        self._chain.integrate_again(self._states.motion)
+        seen, frame = self.tracks.observations, self.tracks.observations.frame.astype(np.int64)
+        self.tracks.replace_rays(self._rays(seen.camera, seen.uv_px, frame)[0])
+
     def landmarks(self) -> tuple[I64, F64]:
         """Return track ids (L,) and places p_M (L, 3) of the landmarks in the window that are not too far."""
         rows = self.tracks.landmark_rows
@@ -249,11 +264,8 @@ class FixedLagSmoother:
 
     def _see(self, frame: WindowFrame) -> None:
         """Add the observations of the newest frame."""
-        rays, valid = self._back_projection.rays(frame.camera, frame.uv_px)
-        if self.calibration.has_lateness:
-            rate_I = self._frames.rate_I[-1] - self._states.gyro_bias[-1]
-            rays = self.calibration.rays_at_frame(frame, rays, self._cameras, rate_I)
-        nothing = np.zeros(len(rays), dtype=np.int64)
+        nothing = np.zeros(len(frame.camera), dtype=np.int64)
+        rays, valid = self._rays(frame.camera, frame.uv_px, nothing - 1)
         seen = Observations(
             nothing, nothing.astype(np.int32), frame.camera.astype(np.int32),
             np.asarray(frame.uv_px, dtype=np.float64),
@@ -262,6 +274,16 @@ class FixedLagSmoother:
         self.tracks.add(
             len(self._states) - 1, frame.track_id[valid].astype(np.int64), seen.take(valid)
         )
+
+    def _rays(self, camera: I32, uv_px: F64, frame: I64) -> tuple[F64, Mask]:
+        """Return unit rays (N, 3) of pixels at the times of their frames (N,), and whether they exist."""
+        rays, valid = self._back_projection.rays(camera, uv_px)
+        if self.calibration.has_lateness:
+            rate_I = self._frames.rate_I[frame] - self._states.gyro_bias[frame]
+            rays = self.calibration.rays_at_frame(
+                camera, uv_px, self._frames.delay_s[frame], rays, self._cameras, rate_I
+            )
+        return rays, valid
 
     def _gate_new(self) -> None:
         """Remove observations of the newest frame far from where landmarks are expected.
@@ -280,18 +302,10 @@ class FixedLagSmoother:
 
     def _triangulate(self, motion: Motion) -> None:
         tracks, options = self.tracks, self.options
-        counts = tracks.counts()
-        is_candidate = ~tracks.is_landmark & ~tracks.is_closed & (counts >= 2)
-        is_candidate &= self._may_be_landmark()
-        num_best = None
+        num_best = length = None
         if options.follows_thesis:
-            long = tracks.num_frames() >= options.thesis_track_length
-            is_candidate &= long | ~tracks.is_active
-            num_best = options.thesis_landmarks_per_update
-        candidates = np.flatnonzero(is_candidate)
-        # tracks that go on first: without them the newest frames hang on samples alone
-        order = np.lexsort((-counts[candidates], ~tracks.is_active[candidates]))
-        candidates = candidates[order]
+            num_best, length = options.thesis_landmarks_per_update, options.thesis_track_length
+        candidates = tracks.candidates(self._may_be_landmark(), length)
         narrow = self._triangulator.add_landmarks(
             tracks, candidates, self._point(),
             only_stereo=motion is not Motion.MOVING, num_best=num_best,

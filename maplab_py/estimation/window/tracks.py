@@ -77,9 +77,34 @@ class Tracks:
         new = dataclasses.replace(seen, row=row, frame=frame).take(~self.is_closed[row])
         self.observations = Observations.concatenate([self.observations, new])
 
+    def replace_rays(self, ray_C: F64) -> None:
+        """Take other rays (O, 3) of the observations; landmarks move with those of their anchors."""
+        seen = self.observations
+        is_anchor = seen.frame == self.anchor_frame[seen.row]
+        is_anchor &= seen.camera == self.anchor_camera[seen.row]
+        row, after, before = seen.row[is_anchor], ray_C[is_anchor], seen.ray_C[is_anchor]
+        self.h[row, :2] += after[:, :2] / after[:, 2:] - before[:, :2] / before[:, 2:]
+        self.observations = dataclasses.replace(seen, ray_C=ray_C)
+
     def counts(self) -> I64:
         """Return the number of observations (T,)."""
         return np.bincount(self.observations.row, minlength=len(self))
+
+    def candidates(self, is_allowed: Mask | bool, length: int | None) -> I64:
+        """Return allowed tracks (rows) that may become landmarks: those that go on first, long ones first.
+
+        Without them the newest frames would hang on samples alone.
+
+        Args:
+            is_allowed: (T,) or all.
+            length: Tracks of fewer frames wait until they end; None = they do not.
+        """
+        counts = self.counts()
+        is_candidate = ~self.is_landmark & ~self.is_closed & (counts >= 2) & is_allowed
+        if length is not None:
+            is_candidate &= (self.num_frames() >= length) | ~self.is_active
+        rows = np.flatnonzero(is_candidate)
+        return rows[np.lexsort((-counts[rows], ~self.is_active[rows]))]
 
     @property
     def is_active(self) -> Mask:

@@ -85,6 +85,11 @@ class SensorWatch:
         self._returns = 0
         self.restart(0)
 
+    def recalibrate(self, device: RecordedSensors, imu: Imu) -> None:
+        """Compare with another calibration from now on; what has failed stays so."""
+        self._device, self._imu = device, imu
+        self._comparison = MotionComparison(device, imu)
+
     def restart(self, now_ns: int) -> None:
         """Forget the motion, and use the whole IMU; the estimator starts again."""
         self._comparison = MotionComparison(self._device, self._imu)

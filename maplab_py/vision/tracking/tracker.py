@@ -71,14 +71,8 @@ class FrameTracker:
         Raises:
             UserError: A mask cannot be used.
         """
-        self._options = options or TrackingOptions()
-        poses = np.asarray(T_I_C, dtype=np.float64).reshape(-1, 7)
-        self._views = tuple(
-            CameraView.of(camera, row, poses[row], self._options)
-            for row, camera in enumerate(cameras)
-        )
-        self._leaders, self._absent = leaders(self._views), frozenset[int]()
-        self._detectors = [self._detector(row) for row in range(len(cameras))]
+        self._options, self._absent = options or TrackingOptions(), frozenset[int]()
+        self._take_cameras(cameras, T_I_C)
         factor = self._options.image_resize_factor
         self._flow = FlowOptions(
             self._options.patch_size_px,
@@ -91,6 +85,26 @@ class FrameTracker:
         self._next_id = self._num_frames = 0
         self._detected = [np.inf] * len(cameras)  # keypoints after the last detection
         self._states: tuple[_CameraState, ...] | None = None
+
+    def _take_cameras(self, cameras: tuple[Camera, ...], T_I_C: F64) -> None:
+        poses = np.asarray(T_I_C, dtype=np.float64).reshape(-1, 7)
+        self._views = tuple(
+            CameraView.of(camera, row, poses[row], self._options)
+            for row, camera in enumerate(cameras)
+        )
+        self._leaders = leaders(self._views, self._absent)
+        self._detectors = [self._detector(row) for row in range(len(cameras))]
+
+    def recalibrate(self, cameras: tuple[Camera, ...], T_I_C: F64) -> None:
+        """Go on with another calibration of the same cameras; all tracks stay."""
+        self._take_cameras(cameras, T_I_C)
+        states = list(self._states or ())
+        for row, state in enumerate(states):
+            ray, _ = self._views[row].rays(state.tracks.uv)
+            states[row] = dataclasses.replace(
+                state, tracks=dataclasses.replace(state.tracks, ray=ray)
+            )
+        self._states = tuple(states) if states else None
 
     def reset(self) -> None:
         """Forget all tracks; ids continue."""
