@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import statistics
 import sys
 import time
@@ -20,6 +21,8 @@ from maplab_py.report import Report
 
 _FILE = "costs.json"
 _MOST_RUNS = 9  # of each command: the median follows a new machine or version soon
+_NEAREST_RUNS = 3
+"""Runs that a prediction rests on: what takes a fixed time on tiny maps says nothing of large ones."""
 _LEAST_SECONDS = 0.05  # a run below tells nothing
 _MOST_FILES = 20_000  # whose sizes are summed
 _MB = 1e6
@@ -65,15 +68,18 @@ class Plan(Report):
 def measuring(call: Call, session: Session) -> Iterator[None]:
     """Measure the command that runs inside, and keep the figures for predictions if it succeeds."""
     before_mb = _input_mb(call, _map_mb(session.maps))
-    memory, began = resident_bytes(), time.perf_counter()
+    unsaved = {entry.key for entry in session.maps.unsaved}
+    memory, peak, began = resident_bytes(), _peak_bytes(), time.perf_counter()
     yield
     seconds = time.perf_counter() - began
     costs = read_costs()
     is_known = call.command.name in costs
     if call.is_trial or (is_known and seconds < _LEAST_SECONDS):
         return
-    grown_mb = max(0.0, _peak_bytes() - memory) / _MB
-    written_mb = sum(_disk_mb(path) for path in _paths(call, is_read=False))
+    is_higher = _peak_bytes() > peak  # else the peak is that of an earlier command
+    grown_mb = max(0.0, (_peak_bytes() if is_higher else resident_bytes()) - memory) / _MB
+    saved = {e.folder for e in session.maps if e.is_saved and e.key in unsaved and e.folder}
+    written_mb = sum(_disk_mb(path) for path in {*_paths(call, is_read=False), *saved})
     cost = Cost(before_mb, seconds, grown_mb, _map_mb(session.maps), written_mb)
     costs[call.command.name] = [*costs.get(call.command.name, []), cost][-_MOST_RUNS:]
     with suppress(OSError):  # the prediction is a convenience
@@ -113,7 +119,7 @@ def predict(steps: list[tuple[str, Call | None]], maps: MapManager) -> Plan:
             _scaled(runs, "seconds", input_mb),
             _scaled(runs, "memory_mb", input_mb),
             _scaled(runs, "disk_mb", input_mb),
-            len(runs),
+            min(len(runs), _NEAREST_RUNS),
         )
         predicted.append(step)
         if runs:
@@ -124,13 +130,14 @@ def predict(steps: list[tuple[str, Call | None]], maps: MapManager) -> Plan:
 
 
 def _scaled(runs: list[Cost], name: str, input_mb: float) -> float:
-    """Return the median of a figure over former runs, each scaled to the present input."""
+    """Return the median of a figure over the former runs of nearest input, scaled to the present one."""
     if not runs:
         return float("nan")
-    values: list[float] = []
-    for run in runs:
-        scale = input_mb / run.input_mb if run.input_mb > 0.0 and input_mb > 0.0 else 1.0
-        values.append(getattr(run, name) * scale)
+    scales = [
+        input_mb / run.input_mb if run.input_mb > 0.0 and input_mb > 0.0 else 1.0 for run in runs
+    ]
+    nearest = sorted(range(len(runs)), key=lambda i: (abs(math.log(scales[i])), -i))[:_NEAREST_RUNS]
+    values: list[float] = [getattr(runs[i], name) * scales[i] for i in nearest]
     return float(f"{statistics.median(values):.2g}")  # it is not more certain than that
 
 
