@@ -22,7 +22,9 @@ from maplab_py.viewer.display.viewer import Viewer
 TARGET = Path(__file__).resolve().parents[1] / "images" / "live_map.webp"
 PAGE = {"width": 1080, "height": 640}
 WIDTH_PX = 900
-MOST_PICTURES = 24
+MOST_PICTURES = 14
+PLAYBACK_RATE = 0.2
+"""Of the recording, so slow that there are many pictures."""
 SHOWN_MS, LAST_MS = 350, 2500
 """Time that a picture is shown, and the last one."""
 
@@ -42,12 +44,12 @@ def pictures(recording: Path) -> list[Image.Image]:
     shown: list[Image.Image] = []
     flags = [flag for flag in HEADLESS_FLAGS if not flag.startswith("--headless")]
     with Session() as session, sync_playwright() as playwright:
-        session.set_flags(["--viewer_port=0", "--viewer_dark"])
         job = session.start(
             "rovioli",
             datasource_folder=recording,
             rovioli_visualize_map=True,
             map_publish_interval_s=1.0,
+            vio_rosbag_realtime_playback_rate=PLAYBACK_RATE,
         )
         browser = playwright.chromium.launch(
             executable_path=find_browser(), args=["--no-sandbox", *flags]

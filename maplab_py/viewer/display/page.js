@@ -357,16 +357,14 @@ const drawBy = (make) => {
 // Colours of the grid, which viser has from the server, in pages that are dark.
 (() => {
   const COLOURS = { light: [0xeceef1, 0xdadde2], dark: [0x2a2c30, 0x3a3d42] };
-  let shown = "";
   setInterval(() => {
     const ground = window.__viserMutable && window.__viserMutable.nodeRefFromName["/ground"];
     if (!ground) return;
     const theme = document.documentElement.dataset.mantineColorScheme || "light";
-    ground.traverse(({ material, id }) => {
-      const uniforms = material && material.uniforms;
-      if (!uniforms || !uniforms.cellColor || shown === theme + id) return;
-      shown = theme + id;
-      const [cell, section] = COLOURS[theme];
+    const [cell, section] = COLOURS[theme];
+    ground.traverse(({ material }) => {
+      const uniforms = material && material.uniforms; // viser may have set them again
+      if (!uniforms || !uniforms.cellColor || uniforms.cellColor.value.getHex() === cell) return;
       uniforms.cellColor.value.set(cell);
       uniforms.sectionColor.value.set(section);
       window.__viserMutable.requestRender();
