@@ -25,11 +25,18 @@ class Rows:
     """Base of dataclasses whose arrays share their first axis; fields that are no arrays are of all rows."""
 
     def __len__(self) -> int:
-        return len(next(iter(self._arrays().values())))
+        values = vars(self)
+        return next(
+            len(values[name])
+            for name in self.__dataclass_fields__
+            if isinstance(values[name], np.ndarray)
+        )
 
     def take(self, rows: NDArray[np.integer] | Mask | slice) -> Self:
         """Return some of the rows."""
-        return dataclasses.replace(self, **{n: array[rows] for n, array in self._arrays().items()})
+        values = vars(self)
+        rest = {name: values[name] for name in self.__dataclass_fields__}
+        return type(self)(**{**rest, **{n: array[rows] for n, array in self._arrays().items()}})
 
     @classmethod
     def concatenate(cls, parts: Sequence[Self]) -> Self:
@@ -40,5 +47,6 @@ class Rows:
         return cls(**{**rest, **joined})
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
-        values = ((field.name, getattr(self, field.name)) for field in dataclasses.fields(self))
-        return {name: value for name, value in values if isinstance(value, np.ndarray)}
+        values = vars(self)  # fields first; values that are computed once follow them
+        names = self.__dataclass_fields__
+        return {name: values[name] for name in names if isinstance(values[name], np.ndarray)}
