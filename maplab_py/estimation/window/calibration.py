@@ -172,6 +172,13 @@ class WindowCalibration:
         """Return the calibration with some values (K,), all known, for frames read backwards."""
         return dataclasses.replace(WindowCalibration.of(*self.calibrated(values)), direction=-1.0)
 
+    def lateness_s(self, camera: I32, uv_px: F64, delay_s: F64 | float, now: WindowCameras) -> F64:
+        """Return how much later than their frames keypoints (N,) were seen; see `rays_at_frame`."""
+        if not self.has_lateness:
+            return np.zeros(len(camera))
+        timing_s = now.timing_s[camera]
+        return np.asarray(timing_s[:, 0] + timing_s[:, 1] * uv_px[:, 1] - delay_s)
+
     def rays_at_frame(
         self,
         camera: I32,
@@ -193,9 +200,8 @@ class WindowCalibration:
             now: The cameras.
             rate_I: Angular velocities (N, 3) of the body.
         """
-        timing_s, q_I_C = now.timing_s[camera], now.T_I_C[camera, :4]
-        late_s = timing_s[:, 0] + timing_s[:, 1] * uv_px[:, 1] - delay_s
-        turn = so3.exp(late_s[:, None] * rate_I)
+        q_I_C = now.T_I_C[camera, :4]
+        turn = so3.exp(self.lateness_s(camera, uv_px, delay_s, now)[:, None] * rate_I)
         return so3.rotate(so3.inverse(q_I_C), so3.rotate(turn, so3.rotate(q_I_C, rays_C)))
 
     def rows(self, kind: str) -> I64:

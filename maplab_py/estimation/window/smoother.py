@@ -72,7 +72,7 @@ class FixedLagSmoother:
             calibration: Of the same cameras, with what of it is estimated; None = nothing.
         """
         self.calibration = calibration or WindowCalibration.of(cameras, T_I_C)
-        self._cameras = self.calibration.of_kernels(self.calibration.mean)
+        self.cameras = self.calibration.of_kernels(self.calibration.mean)
         self.options = options
         self._keyframes_kept = options.keyframes_kept(len(cameras))
         self._solver = SolverOptions(
@@ -163,12 +163,12 @@ class FixedLagSmoother:
 
     def recalibrate(self, cameras: tuple[Camera, ...], T_I_C: F64, imu: Imu) -> None:
         """Express the window with another calibration, of which nothing is estimated; see `WindowChange`."""
-        before = self._cameras, self._chain.corrections
+        before = self.cameras, self._chain.corrections
         self.calibration = WindowCalibration.of(cameras, T_I_C)
-        self._cameras = self.calibration.of_kernels(self.calibration.mean)
+        self.cameras = self.calibration.of_kernels(self.calibration.mean)
         self._back_projection = BackProjection(self._kernels, self.calibration)
         self._chain.take_imu(imu)
-        change = WindowChange.between(before, (self._cameras, self._chain.corrections))
+        change = WindowChange.between(before, (self.cameras, self._chain.corrections))
         window = self._states, self._frames.rate_I, self._chain.mean_samples()
         self._prior, self._states = change.prior(self._prior, *window), change.states(*window)
         self._chain.integrate_again(self._states.motion)
@@ -242,7 +242,7 @@ class FixedLagSmoother:
         self._states = self._states.with_frame(T_M_I, new_motion)
         self._prior = self._prior.with_frame(T_M_I, new_motion)
         if frame.motion is Motion.TURNING and turning.shows_parallax(
-            frame, self._frames.time_ns, self.tracks, self._states.T_M_I, self._cameras.T_I_C,
+            frame, self._frames.time_ns, self.tracks, self._states.T_M_I, self.cameras.T_I_C,
             self._back_projection,
         ):  # fmt: skip
             frame = dataclasses.replace(frame, motion=Motion.MOVING)
@@ -281,7 +281,7 @@ class FixedLagSmoother:
         if self.calibration.has_lateness:
             rate_I = self._frames.rate_I[frame] - self._states.gyro_bias[frame]
             rays = self.calibration.rays_at_frame(
-                camera, uv_px, self._frames.delay_s[frame], rays, self._cameras, rate_I
+                camera, uv_px, self._frames.delay_s[frame], rays, self.cameras, rate_I
             )
         return rays, valid
 
@@ -352,13 +352,13 @@ class FixedLagSmoother:
         """Return frames and cameras as kernels read them."""
         times = self._times()
         twist = np.zeros((0, 7)) if times is None else times.twist(self._states)
-        return WindowPoint(self._states.T_M_I, self._states.h, self._cameras, twist)
+        return WindowPoint(self._states.T_M_I, self._states.h, self.cameras, twist)
 
     def _take_calibration(self) -> None:
         """Use the present calibration from now on."""
         if len(self.calibration):
-            self._cameras = self.calibration.of_kernels(self._states.calibration)
-            self._back_projection.parameters = self._cameras.parameters
+            self.cameras = self.calibration.of_kernels(self._states.calibration)
+            self._back_projection.parameters = self.cameras.parameters
 
     def _covariance(self, problem: WindowProblem) -> F64:
         return problem.newest_covariance(self._states)
@@ -407,7 +407,7 @@ class FixedLagSmoother:
             return False
         last = int(np.flatnonzero(self._frames.is_keyframe)[-1])
         return keyframes.needs_keyframe(
-            self.tracks, self._states.T_M_I, self._cameras.T_I_C, last, self.options
+            self.tracks, self._states.T_M_I, self.cameras.T_I_C, last, self.options
         )
 
     def _slide(self) -> None:
@@ -488,7 +488,7 @@ class FixedLagSmoother:
         self._frames.remove(frame)
 
     def _poses(self) -> CameraPoses:
-        return CameraPoses.of(self._states.T_M_I, self._cameras.T_I_C)
+        return CameraPoses.of(self._states.T_M_I, self.cameras.T_I_C)
 
     # -- report -----------------------------------------------------------------------------------
 

@@ -24,6 +24,8 @@ SPAN_NS, _STEP_NS = 500_000_000, 250_000_000
 _FEWEST_POINTS, _MOST_POINTS = 12, 100
 _ROUNDS = 4
 _CAUCHY_RAD = 3e-3
+_RAY_SIGMA_RAD, _LEAST_INFORMATION = 1e-3, 1e-6
+"""Noise of rays and landmarks, from which the uncertainty of a pose follows."""
 _FIT_RAD = 0.02
 """Largest median angle between rays and landmarks of a pose that counts."""
 
@@ -36,6 +38,8 @@ class Sighting:
     camera: I32  # (K,)
     track_id: I64  # (K,)
     uv_px: F64  # (K, 2)
+    late_s: F64  # (K,) later than the frame
+    twist_I: F64  # (6,) velocity and angular velocity
     times_ns: I64  # (S,)
     accel_gyro: F64  # (S, 6) as measured
 
@@ -59,6 +63,7 @@ class Disagreement:
     acceleration: F64  # (3,) [m/s^2] in I
     since_ns: int
     biases: dict[ImuPart, F64]  # that were taken from the samples
+    sigma: dict[ImuPart, float]  # of rate and acceleration, by noise of the keypoints
     fit_rad: F64  # (C,) median angle between rays and landmarks in the newest frame; nan = too few
 
 
@@ -83,8 +88,11 @@ class MotionComparison:
         """Tell whether it is time to compare, and to remember landmarks."""
         return time_ns >= self._next_ns
 
-    def remember(self, landmarks: tuple[I64, F64], T_M_I: F64, biases: tuple[F64, F64]) -> None:
-        """Remember landmarks at the newest frame, with its pose and biases."""
+    def remember(
+        self, landmarks: tuple[I64, F64], T_M_I: F64, biases: tuple[F64, F64], T_I_C: F64
+    ) -> None:
+        """Remember landmarks at the newest frame, with its pose and biases, and poses (C, 7) of cameras."""
+        self._T_I_C = T_I_C
         time_ns = self._frames[-1].time_ns
         self._next_ns = time_ns + _STEP_NS
         ids, p_M = landmarks
@@ -107,24 +115,26 @@ class MotionComparison:
             return None
         middle = min(range(1, len(span) - 1), key=lambda row: abs(
             2 * span[row].time_ns - snapshot.time_ns - newest.time_ns))  # fmt: skip
-        poses = []
+        poses, covariances = [], []
         T_M_I, fit = snapshot.T_M_I, np.zeros(0)
         for frame in (span[0], span[middle], span[-1]):
             pose = self._pose(frame, snapshot, T_M_I, cameras)
             if pose is None:
                 return None
-            T_M_I, fit = pose
+            T_M_I, fit, covariance = pose
             poses.append(T_M_I)
+            covariances.append(covariance)
         legs = self._integrated([span[1 : middle + 1], span[middle + 1 :]], snapshot.biases)
         rate, acceleration = _compare(np.array(poses), legs, self._imu)
         parts = ImuPart.GYROSCOPE, ImuPart.ACCELEROMETER
         biases = dict(zip(parts, snapshot.biases, strict=True))
-        return Disagreement(rate, acceleration, snapshot.time_ns, biases, fit)
+        sigma = dict(zip(parts, _sigmas(np.array(covariances), legs.duration_s), strict=True))
+        return Disagreement(rate, acceleration, snapshot.time_ns, biases, sigma, fit)
 
     def _pose(
         self, frame: Sighting, snapshot: _Snapshot, T_M_I: F64, cameras: frozenset[int]
-    ) -> tuple[F64, F64] | None:
-        """Return the pose T_M_I (7,) of a frame by its keypoints, and the fit of every camera."""
+    ) -> tuple[F64, F64, F64] | None:
+        """Return the pose T_M_I (7,) of a frame by its keypoints, the fit of every camera, and covariance."""
         row = np.searchsorted(snapshot.track_id, frame.track_id)
         row = np.minimum(row, max(len(snapshot.track_id) - 1, 0))
         is_known: Mask = np.isin(frame.camera, list(cameras))
@@ -143,17 +153,24 @@ class MotionComparison:
         if len(used) < _FEWEST_POINTS // 2:
             return None
         camera, p_M = frame.camera[used], snapshot.p_M[row[used]]
-        T_I_C = self._T_I_C[camera]
-        ray_I = so3.rotate(T_I_C[:, :4], ray_C)
-        T_M_I = pose_by_rays(p_M, ray_I, T_I_C[:, 4:], T_M_I)
-        angle = np.linalg.norm(_residual(T_M_I, p_M, ray_I, T_I_C[:, 4:])[0], axis=1)
+        T_I_C, late_s = self._T_I_C[camera], frame.late_s[used, None]
+        ray_I, p_I_C = so3.rotate(T_I_C[:, :4], ray_C), T_I_C[:, 4:]
+        if late_s.any():
+            turn = so3.exp(late_s * frame.twist_I[3:])
+            ray_I = so3.rotate(turn, ray_I)
+            p_I_C = so3.rotate(turn, p_I_C) + late_s * frame.twist_I[:3]
+        T_M_I = pose_by_rays(p_M, ray_I, p_I_C, T_M_I)
+        residual, jacobian = _residual(T_M_I, p_M, ray_I, p_I_C)
+        angle = np.linalg.norm(residual, axis=1)
         if float(np.median(angle)) > _FIT_RAD:
             return None
         fit = [
             float(np.median(angle[camera == number])) if np.any(camera == number) else np.nan
             for number in range(len(self._tables))
         ]
-        return T_M_I, np.array(fit)
+        information = np.einsum("kij,kil->jl", jacobian, jacobian)
+        information[np.diag_indices(6)] += _LEAST_INFORMATION
+        return T_M_I, np.array(fit), _RAY_SIGMA_RAD**2 * np.linalg.inv(information)
 
     def _integrated(self, legs: list[list[Sighting]], biases: tuple[F64, F64]) -> Preintegrated:
         """Integrate the samples of two legs."""
@@ -184,6 +201,14 @@ def _compare(T_M_I: F64, legs: Preintegrated, imu: Imu) -> tuple[F64, F64]:
     )
     acceleration_M = (by_samples - (steps[1] - steps[0])) / (0.5 * dt.sum())
     return rate, so3.rotate(so3.inverse(T_M_I[1, :4]), acceleration_M)
+
+
+def _sigmas(covariance: F64, dt: F64) -> tuple[float, float]:
+    """Return the deviations of rate and acceleration, from those of poses (3, 6, 6) at the ends of legs."""
+    turn = np.trace(covariance[:, :3, :3], axis1=1, axis2=2)
+    position = np.trace(covariance[:, 3:, 3:], axis1=1, axis2=2)
+    of_steps = np.array([1.0 / dt[0], np.sum(1.0 / dt), 1.0 / dt[1]]) / (0.5 * dt.sum())
+    return float(np.sqrt(turn[0] + turn[2]) / dt.sum()), float(np.sqrt(of_steps**2 @ position))
 
 
 def pose_by_rays(p_M: F64, ray_I: F64, p_I_C: F64, T_M_I: F64) -> F64:

@@ -26,6 +26,8 @@ _FLOOR = {ImuPart.GYROSCOPE: 0.03, ImuPart.ACCELEROMETER: 0.3}
 _FACTOR, _REMEMBERED, _FEWEST = 8.0, 40, 4
 """A disagreement is above so many medians of those of the last ten seconds, of which there must be four. On
 Tango's map, whose shutter rolls, single ones reach nine and thirteen medians, never two in a row."""
+_SIGMAS = 3.0
+"""A disagreement is above so many deviations by noise: few points in a corner tell little."""
 _IN_ROW = 2
 _WHOLE_IN_ROW = 5
 """Comparisons that must agree with a constant bias until a part of the IMU is used again."""
@@ -228,9 +230,16 @@ class SensorWatch:
             interval: Its samples as measured.
             smoother: The window after it.
         """
+        states, cameras_now = smoother.states, smoother.cameras
+        v_I = so3.rotate(so3.inverse(states.T_M_I[-1, :4]), states.motion[-1, :3])
+        rate_I = interval.accel_gyro[-1, 3:] - states.motion[-1, 3:6]
+        late_s = smoother.calibration.lateness_s(
+            frame.camera, frame.uv_px, frame.delay_s, cameras_now
+        )
         self._comparison.push(
             Sighting(
                 frame.time_ns, frame.camera, frame.track_id, frame.uv_px,
+                late_s, np.concatenate([v_I, rate_I]),
                 interval.times_ns, interval.accel_gyro,
             )
         )  # fmt: skip
@@ -243,16 +252,16 @@ class SensorWatch:
             shifted = self._shifted_camera(disagreement, cameras, frame.time_ns)
             if shifted is None:
                 self._judge(disagreement, frame.time_ns, smoother)
-        states = smoother.states
         biases = states.motion[-1, 3:6], states.motion[-1, 6:]
-        self._comparison.remember(smoother.landmarks(), states.T_M_I[-1], biases)
+        T_I_C = cameras_now.T_I_C
+        self._comparison.remember(smoother.landmarks(), states.T_M_I[-1], biases, T_I_C)
 
     def _shifted_camera(
         self, joint: Disagreement, cameras: frozenset[int], now_ns: int
     ) -> int | None:
         """Find the camera of several that alone contradicts the IMU; leave it out."""
         if len(cameras) < 2 or not (
-            np.nanmax(joint.fit_rad) > _MISFIT_RAD or self._is_unusual(joint)
+            np.nanmax(joint.fit_rad) > _MISFIT_RAD or self._excess(joint, sigmas=_SIGMAS) > 1.0
         ):
             return None
         alone = {row: self._comparison.compared(frozenset([row])) for row in cameras}
@@ -276,12 +285,19 @@ class SensorWatch:
     def _is_unusual(self, disagreement: Disagreement) -> bool:
         return self._excess(disagreement) > 1.0
 
-    def _excess(self, disagreement: Disagreement, parts: Iterable[ImuPart] = tuple(PARTS)) -> float:
+    def _excess(
+        self,
+        disagreement: Disagreement,
+        parts: Iterable[ImuPart] = tuple(PARTS),
+        sigmas: float = 0.0,
+    ) -> float:
         """Return the larger excess of the parts of the IMU that are whole; 0 without a gyroscope."""
         if ImuPart.GYROSCOPE in self.failed:
             return 0.0
         counted = (
-            self._usual[part].excess(part, _of(disagreement, part))
+            self._usual[part].excess(
+                part, _of(disagreement, part), sigmas * disagreement.sigma[part]
+            )
             for part in parts
             if part not in self.failed and disagreement.since_ns >= self._usual[part].from_ns
         )
@@ -305,7 +321,7 @@ class SensorWatch:
     ) -> bool:
         """Return whether a part of the IMU agrees with the images; leave it out if not for long."""
         usual, error = self._usual[part], _of(new, part)
-        if usual.add(part, error) <= 1.0:
+        if usual.add(part, error, _SIGMAS * new.sigma[part]) <= 1.0:
             usual.since_ns, usual.bias = new.since_ns, new.biases[part]
             return True
         if usual.in_row >= _IN_ROW:
@@ -357,15 +373,15 @@ class _Usual:
         self.in_row, self.since_ns = 0, 0
         self.from_ns = 0  # from which on errors count
 
-    def excess(self, part: ImuPart, error: F64) -> float:
+    def excess(self, part: ImuPart, error: F64, noise: float) -> float:
         """Return the size of an error as a multiple of what is possible; 0 while nothing is known."""
         if len(self._sizes) < _FEWEST:
             return 0.0
-        return float(np.linalg.norm(error)) / self._limit(part)
+        return float(np.linalg.norm(error)) / max(self._limit(part), noise)
 
-    def add(self, part: ImuPart, error: F64) -> float:
+    def add(self, part: ImuPart, error: F64, noise: float) -> float:
         """Take an error; return it as a multiple of what is possible."""
-        excess = self.excess(part, error)
+        excess = self.excess(part, error, noise)
         self.in_row = self.in_row + 1 if excess > 1.0 else 0
         if not self.in_row:
             self._sizes.append(float(np.linalg.norm(error)))

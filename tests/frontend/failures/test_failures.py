@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from maplab_py.estimation.window.calibration import WindowCalibration
 from maplab_py.estimation.window.frame import ImuPart
 from maplab_py.frontend.failures.images import ImageWatch
 from maplab_py.frontend.failures.motion import pose_by_rays
@@ -138,14 +139,16 @@ def _resting(rng: np.random.Generator) -> np.ndarray:
     return np.array([0.0, 0, 9.81, 0, 0, 0]) + rng.normal(0.0, 1e-3, (11, 6))
 
 
-def _window(gyro_bias: float = 0.0) -> Any:
-    """Return a window of two frames at rest, with a bias about z."""
+def _window(gyro_bias: float = 0.0, camera: Camera = _CAMERA) -> Any:
+    """Return a window of two frames at rest, with a bias about z, for one or two cameras."""
+    calibration = WindowCalibration.of((camera,) * 2, se3.identity(2))
     rng = np.random.default_rng(3)
     p_M, motion = rng.uniform([-2, -1, 4], [2, 1, 8], (60, 3)), np.zeros((2, 9))
     motion[:, 5] = gyro_bias
     return SimpleNamespace(
         states=SimpleNamespace(T_M_I=se3.identity(2), motion=motion), doubt_imu=lambda *_: None,
         times_ns=np.array([0, _FRAME_NS]), landmarks=lambda: (np.arange(60), p_M),
+        calibration=calibration, cameras=calibration.of_kernels(calibration.mean),
     )  # fmt: skip
 
 
@@ -160,7 +163,7 @@ def _frame(cameras: int = 1) -> Any:
     uv_px = 200.0 * p_M[:, :2] / p_M[:, 2:] + [160.0, 120.0]
     return SimpleNamespace(
         camera=np.repeat(np.arange(cameras), 60), track_id=np.tile(np.arange(60), cameras),
-        uv_px=np.tile(uv_px, (cameras, 1)),
+        uv_px=np.tile(uv_px, (cameras, 1)), delay_s=0.0,
     )  # fmt: skip
 
 
@@ -183,6 +186,39 @@ def test_a_shifted_camera_is_told_from_a_wrong_gyroscope(kind: str) -> None:
         watch.compare(frame, _interval(row, samples), window)
     assert [failure.sensor for failure in watch.failures] == [kind.removesuffix(" at the limit")]
     assert watch.left_out == (frozenset([1]) if kind == "camera 1" else frozenset())
+
+
+@pytest.mark.parametrize("is_known", [True, False])
+def test_a_rolling_shutter_that_is_known_contradicts_no_sample(*, is_known: bool) -> None:
+    rolling = dataclasses.replace(_CAMERA, line_delay_ns=60_000, image_delay_s=-0.0072)
+    rng, watch, frame = np.random.default_rng(5), _watch(), _frame()
+    window = _window(camera=rolling if is_known else _CAMERA)
+    p_M = window.landmarks()[1]
+
+    def angle(time_s: Any) -> Any:
+        return 0.2 * np.sin(10.0 * np.maximum(time_s - 3.0, 0.0))  # about y
+
+    def turn(time_s: Any) -> np.ndarray:
+        return so3.exp(np.multiply.outer(angle(time_s), [0.0, 1.0, 0.0]))
+
+    for row in range(1, 120):
+        time_s = 1e-9 * row * _FRAME_NS
+        samples, sample_s = _resting(rng), np.linspace(time_s - 0.05, time_s, 11)
+        samples[:, :3] += so3.rotate(so3.inverse(turn(sample_s)), np.array([0.0, 0, 9.81])) - [
+            0,
+            0,
+            9.81,
+        ]
+        samples[:, 4] += (angle(sample_s + 1e-5) - angle(sample_s - 1e-5)) / 2e-5
+        for _ in range(4):  # the row of a point tells when it is seen, and that where
+            late_s = rolling.image_delay_s + 60e-6 * frame.uv_px[:, 1]
+            p_C = so3.rotate(so3.inverse(turn(time_s + late_s)), p_M)
+            frame.uv_px = 200.0 * p_C[:, :2] / p_C[:, 2:] + [160.0, 120.0]
+        frame.time_ns = row * _FRAME_NS
+        window.states.T_M_I[-1, :4] = turn(time_s)
+        watch.usable(_interval(row, samples), window)
+        watch.compare(frame, _interval(row, samples), window)
+    assert bool(watch.failures) != is_known
 
 
 def test_a_gyroscope_with_another_bias_comes_back_and_stays() -> None:
