@@ -46,7 +46,7 @@ Fault = Callable[[Recording], Recording]
 _STREAM = 34
 _START_S, _RATIO, _WRONG_SHARE = 4.0, 2.0, 0.01
 """Bars of start and error, and the error, as a share of the path, from which a map is called wrong."""
-_FISHEYE = CameraOptions(
+FISHEYE = CameraOptions(
     distortion="equidistant",
     intrinsics=(190.98, 190.97, 254.93, 256.90),
     distortion_parameters=(0.0034, 0.0007, -0.0020, 0.0002),
@@ -133,7 +133,7 @@ def _device_and_motion(
     stereo = load_scenario("flight_easy").cameras
     if kind == "handheld":
         file = shared / "tumvi_imu" / f"room{rng.choice([1, 4])}.gt.csv"
-        return (_FISHEYE,), rate_hz, _along(file, begin_s, duration_s)
+        return (FISHEYE,), rate_hz, _along(file, begin_s, duration_s)
     if kind == "flight":
         file = shared / "euroc_imu" / "V101.gt.csv"
         return stereo, rate_hz, _along(file, begin_s, duration_s)
