@@ -45,12 +45,15 @@ class CalibrationBeside:
         self._worker: _Worker | None = None
         self._device: RecordedSensors | None = None  # as segments are recorded now
         self._switches: list[str] = []
+        self._held: Piece | None = None  # the newest segment, while the odometry may still diverge
 
     def after_frame(self, update: OdometryUpdate, mapping: Mapping) -> None:
         """Hand a segment on when one is complete."""
         if mapping is not self._mapping:  # the first run, or the same recording once more
             self.close()
             self._mapping, self._mission, self._device = mapping, -1, None
+        if update.has_diverged:
+            self._held = None
         if self._options.apply == "now":
             self._switch(update, mapping)
         builder = mapping.builder
@@ -86,8 +89,14 @@ class CalibrationBeside:
             self._device = self._mapping.odometry.device
             opening = Opening(self._options, self._device)
             self._worker = _Worker(opening, self._options.processor_share)
-        self._worker.put(Piece(self._session, part))
+        self._hand_on(Piece(self._session, part))
         self._begin_ns = int(part.states[-1].time_ns[0])
+
+    def _hand_on(self, following: Piece | None) -> None:
+        """Hand on the segment that was held back, and hold the following one back."""
+        if self._worker is not None and self._held is not None:
+            self._worker.put(self._held)
+        self._held = following
 
     def _switch(self, update: OdometryUpdate, mapping: Mapping) -> None:
         """Go on with a proposed calibration once the odometry is at a keyframe and sure enough."""
@@ -145,6 +154,7 @@ class CalibrationBeside:
             recorded = mapping.builder.recorded(self._mission)
             if recorded.last_ns is not None:
                 self._cut(recorded, recorded.last_ns, OPTIONS.segment_keyframes // 2 + 1)
+        self._hand_on(None)
         notes = mapping.statistics.notes
         notes += self._switches
         if self._worker is None:
@@ -157,7 +167,7 @@ class CalibrationBeside:
         """End the process; what it has written stays."""
         if self._worker is not None:
             self._worker.close()
-        self._worker = None
+        self._worker = self._held = None
 
 
 class _Worker:

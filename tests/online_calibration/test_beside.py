@@ -41,6 +41,24 @@ def test_segments_of_a_run_reach_the_database(tmp_path: Path) -> None:
     np.testing.assert_array_equal(stamps, vi_map.vertices.timestamp_ns[: len(stamps)])
 
 
+def test_the_segment_before_a_divergence_does_not_count(tmp_path: Path) -> None:
+    vi_map, truth = replayed(cameras=1)
+    options = OnlineCalibrationOptions(is_on=True, database=tmp_path / "device.segments")
+    beside = CalibrationBeside(options)
+
+    class Diverging:
+        def after_frame(self, update: OdometryUpdate, mapping: Mapping) -> None:
+            is_last = mapping.statistics.frames == len(vi_map.vertices)
+            beside.after_frame(dataclasses.replace(update, has_diverged=is_last), mapping)
+
+    start = KnownStart(truth, with_biases=True)
+    mapping = Mapping(MapRecording(vi_map, 0), observer=Diverging(), make_starter=start)
+    mapping.run()
+    beside.finish(mapping, SILENT)
+    # the first of two segments was held back then; the second comes from the end of the map
+    assert "1 segments evaluated, 1 in" in mapping.statistics.notes[-1]
+
+
 def test_the_next_run_begins_with_a_proposal_only_if_it_shall(tmp_path: Path) -> None:
     vi_map, _ = replayed()
     recording = MapRecording(vi_map, 0)
