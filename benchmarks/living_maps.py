@@ -24,7 +24,7 @@ from maplab_py.algorithms.landmarks.persistence import PersistenceOptions, exist
 from maplab_py.algorithms.localization.database import database_of_map
 from maplab_py.algorithms.localization.localization import align_robustly, localize_missions
 from maplab_py.algorithms.localization.options import LocalizationOptions
-from maplab_py.algorithms.map_update.changes import missing_regions, seen_by
+from maplab_py.algorithms.map_update.changes import MIN_EARLIER, missing_regions, seen_by
 from maplab_py.algorithms.map_update.options import UpdateOptions
 from maplab_py.algorithms.map_update.thinning import choose_vertices, size_mb, thin
 from maplab_py.algorithms.map_update.update import gather, merge_session, prepare_session
@@ -113,6 +113,10 @@ def calibration(vi_map: VIMap, truth: Truth, session: int) -> list[list[float]]:
 def objects(vi_map: VIMap, truth: Truth, world: World, numbers: I64, split: int) -> dict[str, int]:
     """Compare the changes that are reported at a refurbishment with those of the furniture and points.
 
+    A region is right if half of its landmarks do not exist in the session of the image that is shown to miss
+    them; `strict` counts those that exist in none of the sessions on that side. Furniture counts that has
+    `LEAST_SEEN` mapped landmarks; `unmapped` is the number of the other pieces.
+
     Args:
         vi_map: Map of all its sessions.
         truth: Their truth.
@@ -123,25 +127,29 @@ def objects(vi_map: VIMap, truth: Truth, world: World, numbers: I64, split: int)
     assert world.exists is not None
     assert world.has_box is not None
     point = truth.point[IdIndex(truth.landmark_id).rows(vi_map.landmarks.id)]
-    good, result = (
-        vi_map.landmarks.quality == 2,
-        dict.fromkeys(("right", "wrong", "found", "all"), 0),
-    )
+    good = vi_map.landmarks.quality == 2
+    result = dict.fromkeys(("right", "strict", "wrong", "found", "all", "unmapped"), 0)
+    session_of = numbers[vi_map.vertices.mission[vi_map.frames.vertex]]
     for by in (numbers >= split, numbers < split):
-        regions, _ = missing_regions(vi_map, by)
+        is_later = bool(by[-1])
+        least = 1 if is_later else MIN_EARLIER
+        regions, _ = missing_regions(vi_map, by, least_sessions=least)
         gone = ~world.exists[numbers[by]][:, point].any(axis=0)
-        right = sum(bool(gone[region.landmarks].mean() >= 0.5) for region in regions)
-        result["right"] += right
-        result["wrong"] += len(regions) - right
+        for region in regions:
+            exists = world.exists[session_of[region.missing_frame], point[region.landmarks]]
+            result["right" if exists.mean() <= 0.5 else "wrong"] += 1
+            result["strict"] += bool(gone[region.landmarks].mean() >= 0.5)
         seen = good & gone & seen_by(vi_map, ~by)
         before, after = world.has_box[split - 1], world.has_box[split]
-        for low, high in world.boxes[before & ~after if by[-1] else after & ~before]:
+        for low, high in world.boxes[before & ~after if is_later else after & ~before]:
             p = world.p_G[point]
             mine = seen & ((p > low - ON_BOX_M) & (p < high + ON_BOX_M)).all(axis=1)
-            if np.count_nonzero(mine) >= LEAST_SEEN:
-                hits = [np.count_nonzero(mine[region.landmarks]) for region in regions]
-                result["all"] += 1
-                result["found"] += int(max(hits, default=0) >= LEAST_HITS)
+            if np.count_nonzero(mine) < LEAST_SEEN:
+                result["unmapped"] += 1
+                continue
+            hits = [np.count_nonzero(mine[region.landmarks]) for region in regions]
+            result["all"] += 1
+            result["found"] += int(max(hits, default=0) >= LEAST_HITS)
     return result
 
 

@@ -2,7 +2,7 @@
 
 A landmark of the earlier sessions that the later ones should have seen and did not may have vanished, or was
 not detected; likewise one of the later sessions that the earlier ones did not see. A region has changed where
-many more landmarks are missing than elsewhere.
+many more landmarks are missing than elsewhere: the chance of a miss is counted in the rest of the map.
 """
 
 import dataclasses
@@ -18,19 +18,23 @@ from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap, to_hex_list
 from maplab_py.vision.descriptors import DescriptorKind, differences
 
-_RADIUS_M = 0.5
-"""Landmarks within this distance say whether the place of a landmark has changed."""
+_SIGMA_M, _REACH = 0.25, 3.0
+"""Standard deviation of the weight of landmarks around a landmark by their distance, and how many count."""
+_LINK_M, _INSIDE_M = 0.8, 0.2
+"""Largest gaps in a region, and the distance from it within which matched landmarks speak against it."""
 _PLACES, _SESSIONS = np.array([2, 3, 4, 6, 9, 15]), 4
 """Bounds of the numbers of places and of sessions by which the chance of a miss is counted."""
 _LEAST_CHANCE = 0.02
+_ROUNDS = 2
+"""Rounds of counting that chance: each without the landmarks that the one before has for changed."""
 _MATCHED_SHARE = 0.8
 """Weight of matched landmarks against missing ones: those of the wall behind an object stay."""
-_EVIDENCE_AROUND, _EVIDENCE = 4.0, 5.0
+_EVIDENCE_AROUND, _EVIDENCE = 1.5, 10.0
 """Least logarithm of the chance that nothing changed around a landmark, and in a whole region."""
-_MIN_MISSING, _MIN_SHARE, _MIN_REGION_SHARE = 4, 0.7, 0.7
-"""Missing landmarks of a region that is reported, at least, and their share around each and around all."""
-_MIN_EARLIER = 2
-"""Earlier sessions that must have missed what counts as new: one misses much by chance."""
+_MIN_MISSING, _MIN_SHARE = 4, 0.7
+"""Missing landmarks of a region that is reported, at least, and their share in it."""
+MIN_EARLIER, _QUARTER = 2, 0.75
+"""Earlier sessions that must have missed a quarter of what counts as new: one misses much by chance."""
 _SAME_SHARE = 0.3
 """Share of a region's landmarks that look like those of another, if it has moved there."""
 _SAME_BITS = 0.2
@@ -63,9 +67,9 @@ def find_changes(vi_map: VIMap, later: Mask, progress: Progress = SILENT) -> Cha
     if later.all() or not later.any():
         raise UserError("changes need earlier and later missions: all of them are on one side")
     vanished, missed = missing_regions(vi_map, later, progress)
-    appeared, unseen = missing_regions(vi_map, ~later, progress)
+    appeared, unseen = missing_regions(vi_map, ~later, progress, least_sessions=MIN_EARLIER)
     notes = []
-    if np.count_nonzero(~later) < _MIN_EARLIER:
+    if np.count_nonzero(~later) < MIN_EARLIER:
         appeared = []
         notes.append("one earlier session does not tell what appeared since")
     times = session_times_s(vi_map)
@@ -107,9 +111,12 @@ def seen_by(vi_map: VIMap, missions: Mask) -> Mask:
 
 
 def missing_regions(
-    vi_map: VIMap, by: Mask, progress: Progress = SILENT
+    vi_map: VIMap, by: Mask, progress: Progress = SILENT, *, least_sessions: int = 1
 ) -> tuple[list[Region], Mask]:
-    """Return the regions that some missions (M,) miss and others see, and all landmarks that they miss."""
+    """Return the regions that some missions (M,) miss and others see, and all landmarks that they miss.
+
+    A quarter of a region's landmarks must be missed by so many sessions: in one they are missed together.
+    """
     count = len(vi_map.landmarks)
     of, seen = seen_by(vi_map, ~by), seen_by(vi_map, by)
     predicted, matched, sessions = np.zeros((3, count), dtype=np.int64)
@@ -128,8 +135,14 @@ def missing_regions(
     is_missed = is_asked & (matched == 0) & ~seen
     expected = np.concatenate(frames), np.concatenate(landmarks)
     asked = np.flatnonzero(is_asked)
-    surprise = _surprise(predicted[asked], sessions[asked], is_missed[asked])
-    regions = _regions(vi_map.p_G[asked], asked, is_missed[asked], surprise)
+    regions: list[Region] = []
+    for _ in range(_ROUNDS):
+        changed = np.zeros(count, dtype=np.bool_)
+        changed[np.concatenate([asked[:0], *(region.landmarks for region in regions)])] = True
+        missing = is_missed[asked]
+        surprise = _surprise(predicted[asked], sessions[asked], missing, changed[asked])
+        regions = _regions(vi_map.p_G[asked], asked, is_missed[asked], surprise)
+    regions = [r for r in regions if np.quantile(sessions[r.landmarks], _QUARTER) >= least_sessions]
     return [_with_views(vi_map, region, by, expected) for region in regions], is_missed
 
 
@@ -161,41 +174,47 @@ def _with_views(vi_map: VIMap, region: Region, by: Mask, expected: tuple[I64, I6
     )
 
 
-def _surprise(places: I64, sessions: I64, is_missed: Mask) -> F64:
+def _surprise(places: I64, sessions: I64, is_missed: Mask, is_changed: Mask) -> F64:
     """Return minus the logarithm of the chance that a landmark is missed although it is there (N,).
 
-    It is the share of missed landmarks among those that as many places and sessions should have seen.
+    It is the share of missed landmarks among the unchanged ones that as many places and sessions should have
+    seen.
     """
     group = _SESSIONS * np.digitize(places, _PLACES) + np.minimum(sessions, _SESSIONS) - 1
-    missed, every = np.bincount(group, is_missed), np.bincount(group)
-    share = (missed + 1.0) / (every + 2.0)
+    same, groups = group[~is_changed], _SESSIONS * (len(_PLACES) + 1)
+    missed = np.bincount(same, is_missed[~is_changed], minlength=groups)
+    share = (missed + 1.0) / (np.bincount(same, minlength=groups) + 2.0)
     return np.asarray(-np.log(np.clip(share, _LEAST_CHANCE, 0.9))[group])
 
 
 def _regions(p_G: F64, asked: I64, is_missed: Mask, surprise: F64) -> list[Region]:
-    """Return connected regions of landmarks among those asked for (N,) that are missing together."""
+    """Return connected regions of landmarks among those asked for (N,) that are missing together.
+
+    Near landmarks count more: what stands close to a wall hides few of the landmarks behind it.
+    """
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
-    if len(asked) == 0:
+    if not is_missed.any():
         return []
     tree = cKDTree(p_G)
-    near = tree.sparse_distance_matrix(tree, _RADIUS_M, output_type="coo_matrix").tocsr()
-    near.setdiag(1.0)
-    near.data[:] = 1.0
-    evidence = near @ np.where(is_missed, surprise, -_MATCHED_SHARE * surprise)
-    missing, around = near @ is_missed.astype(np.float64), np.asarray(near.sum(axis=1)).reshape(-1)
-    rows = np.flatnonzero(
-        is_missed & (evidence > _EVIDENCE_AROUND) & (missing >= _MIN_SHARE * around)
-    )
-    groups, label = connected_components(near[rows][:, rows], directed=False)
+    weights = tree.sparse_distance_matrix(tree, _REACH * _SIGMA_M, output_type="coo_matrix").tocsr()
+    weights.data = np.exp(-0.5 * np.square(weights.data / _SIGMA_M))
+    weights.setdiag(1.0)
+    evidence = weights @ np.where(is_missed, surprise, -_MATCHED_SHARE * surprise)
+    rows = np.flatnonzero(is_missed & (evidence > _EVIDENCE_AROUND))
+    if len(rows) == 0:
+        return []
+    gaps = cKDTree(p_G[rows])
+    linked = gaps.sparse_distance_matrix(gaps, _LINK_M, output_type="coo_matrix")
+    groups, label = connected_components(linked, directed=False)
     regions = []
     for group in range(groups):
         inside = rows[label == group]
-        close = np.count_nonzero(np.asarray(near[inside].sum(axis=0)).reshape(-1))
-        is_large = len(inside) >= max(_MIN_MISSING, _MIN_REGION_SHARE * close)
+        close = np.isfinite(cKDTree(p_G[inside]).query(p_G, distance_upper_bound=_INSIDE_M)[0])
+        is_large = len(inside) >= _MIN_MISSING and is_missed[close].mean() >= _MIN_SHARE
         if is_large and surprise[inside].sum() >= _EVIDENCE:
-            regions.append(Region(asked[inside], int(close)))
+            regions.append(Region(asked[inside], int(np.count_nonzero(close))))
     return regions
 
 
