@@ -7,7 +7,7 @@ import datetime as dt
 import os
 import weakref
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -114,7 +114,7 @@ def _used(earlier: list[Word]) -> set[str]:
     }
 
 
-def _flags(flags: dict[str, Flag], current: Word, used: set[str]) -> list[Candidate]:
+def _flags(flags: Mapping[str, Flag], current: Word, used: set[str]) -> list[Candidate]:
     typed = normalise(current.text.lstrip("-"))
     candidates = []
     for name, flag in flags.items():

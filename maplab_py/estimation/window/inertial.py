@@ -69,7 +69,7 @@ class InertialChain:
     def mean_samples(self) -> F64:
         """Return the mean (2, 3) of the samples of gyroscope and accelerometer; zeros without edges."""
         samples = [values for _, values in self._samples] or [np.zeros((1, 6))]
-        return np.concatenate(samples).mean(axis=0).reshape(2, 3)[::-1]
+        return np.asarray(np.concatenate(samples).mean(axis=0).reshape(2, 3)[::-1])
 
     def integrate_again(self, motion: F64) -> None:
         """Integrate all edges with the present IMU and the biases in the motion (F, 9) of the frames."""
