@@ -352,6 +352,19 @@ def test_extent_leaves_out_outliers() -> None:
     assert _scene(wild).extent.radius_m == pytest.approx(radius, rel=0.1)
 
 
+def test_a_device_that_stands_sees_its_room() -> None:
+    vi_map = walk_map(landmarks=400)
+    T = np.array(vi_map.vertices.T_M_I)
+    T[:, 4:] *= 1e-3
+    standing = vi_map.replace(vertices=vi_map.vertices.replace(T_M_I=T))
+    extent = _scene(standing).extent
+    low, high = np.percentile(standing.p_G, [10.0, 90.0], axis=0)
+    assert (extent.outline.min(axis=0) <= low).all()
+    assert (extent.outline.max(axis=0) >= high).all()
+    dark = standing.replace(landmarks=vi_map.landmarks.replace(p_I=np.full((400, 3), np.nan)))
+    assert _scene(dark).extent.radius_m < 0.05
+
+
 def test_comparison_shows_by_how_much_vertices_moved(two_missions: VIMap) -> None:
     T = np.array(two_missions.vertices.T_M_I)
     T[:, 6] += 0.5
