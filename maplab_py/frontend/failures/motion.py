@@ -168,7 +168,8 @@ class MotionComparison:
             float(np.median(angle[camera == number])) if np.any(camera == number) else np.nan
             for number in range(len(self._tables))
         ]
-        information = np.einsum("kij,kil->jl", jacobian, jacobian)
+        near = jacobian[angle < _CAUCHY_RAD]
+        information = np.einsum("kij,kil->jl", near, near)
         information[np.diag_indices(6)] += _LEAST_INFORMATION
         return T_M_I, np.array(fit), _RAY_SIGMA_RAD**2 * np.linalg.inv(information)
 
