@@ -67,7 +67,7 @@ class WaitingFrames:
             np.concatenate([values for _, values in parts]),
         )
 
-    def delay(self, delay_ns: int, after: tuple[I64, F64]) -> None:
+    def delay(self, delay_ns: int, after: tuple[I64, F64], delay_s: float) -> None:
         """Cut the samples again at frames that are all later by a delay.
 
         Frames that no sample comes before are forgotten.
@@ -75,6 +75,7 @@ class WaitingFrames:
         Args:
             delay_ns: The delay; may be negative.
             after: Samples (S,), (S, 6) beyond the newest frame.
+            delay_s: That of all frames from now on; see `WindowFrame`.
         """
         parts = [self._before, *((f.imu_times_ns, f.accel_gyro) for f in self.frames[1:]), after]
         times_ns, rows = np.unique(np.concatenate([t for t, _ in parts]), return_index=True)
@@ -90,7 +91,7 @@ class WaitingFrames:
             self.frames.append(
                 dataclasses.replace(
                     frame, time_ns=at_ns, imu_times_ns=cut_ns, accel_gyro=cut,
-                    delay_s=frame.delay_s + 1e-9 * delay_ns,
+                    delay_s=delay_s,
                 )
             )  # fmt: skip
             self.stamps_ns.append(stamp_ns)

@@ -38,7 +38,14 @@ class DelayMonitor:
         assert device.imu is not None
         self._imu = device.imu
         self._rays = rays.RayMaker(device.cameras, device.T_I_C)
+        middle_s = [c.delay_s(np.array([[0.0, 0.5 * c.height_px]])) for c in device.cameras]
+        self._known_s = float(np.mean(middle_s))
         self.reset()
+
+    @property
+    def unknown_s(self) -> float:
+        """Applied delay of the middle rows without what of it is in the calibration."""
+        return self.applied_s - self._known_s if self.applied_s else 0.0
 
     @property
     def delay_s(self) -> float:

@@ -227,17 +227,21 @@ class Odometry:
     def _wanted_delay_ns(self) -> int:
         return 0 if self._delays is None else round(self._delays.applied_s * 1e9)
 
+    @property
+    def _delay_s(self) -> float:  # of frames, as far as the calibration of the window includes it
+        delays = None if len(self._calibration) else self._delays
+        return 1e-9 * self._delay_ns - (0.0 if delays is None else delays.unknown_s)
+
     def _apply_delay(self) -> None:
         """Change the delay of frames: at once before the start, in small steps after it."""
-        change_ns = self._wanted_delay_ns - self._delay_ns
-        if not change_ns:
+        if not (change_ns := self._wanted_delay_ns - self._delay_ns):
             return
         if self._smoother is not None:
             self._delay_ns += int(np.clip(change_ns, -_DELAY_STEP_NS, _DELAY_STEP_NS))
             return
         self._delay_ns += change_ns
         self._detector.reset()
-        self._backfiller.waiting.delay(change_ns, self._buffer.samples)
+        self._backfiller.waiting.delay(change_ns, self._buffer.samples, self._delay_s)
         if isinstance(self._starter, initializer.Initializer):
             self._starter.replace_frames(self._backfiller.waiting.frames)
         if self._last_ns is not None:
@@ -288,9 +292,7 @@ class Odometry:
         )
         if self._gap_end_ns >= 0:
             return update
-        frame = dataclasses.replace(
-            update.window_frame(), delay_s=1e-9 * self._delay_ns, failed=failed
-        )
+        frame = dataclasses.replace(update.window_frame(), delay_s=self._delay_s, failed=failed)
         has_new_delay = self._measure_delay(update, frame)
         if self._smoother is not None:
             update = self._smoothed(update, frame, self._smoother)
@@ -435,8 +437,7 @@ class Odometry:
         )  # fmt: skip
 
     def _new_smoother(self) -> FixedLagSmoother:
-        device, window = self._device, self.options.window
-        rig = device.cameras, device.T_I_C, self._imu, window
+        rig = self._device.cameras, self._device.T_I_C, self._imu, self.options.window
         calibration = self._calibration.with_delay(1e-9 * self._delay_ns)
         if self._map_rule is None:
             return FixedLagSmoother(*rig, calibration)
@@ -446,11 +447,10 @@ class Odometry:
         """Keep what the window says of the calibration now, for the report and the next start."""
         if self._smoother is None or not len(self._calibration):
             return
-        estimate = CalibrationEstimate(
+        self.calibration_estimate = estimate = CalibrationEstimate(
             self._calibration, self._smoother.states.calibration,
             self._smoother.calibration_sigma(), 1e-9 * self._delay_ns,
         )  # fmt: skip
-        self.calibration_estimate = estimate
         self._calibration = dataclasses.replace(self._calibration, mean=estimate.values)
 
     def _smoothed(

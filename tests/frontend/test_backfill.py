@@ -88,9 +88,10 @@ def test_waiting_frames_with_a_delay_keep_their_samples() -> None:
     for frame in starter.waiting:
         waiting.push(frame.time_ns, frame, (np.zeros(0, dtype=np.int64), np.zeros((0, 6))))
     plain = list(waiting.frames)
-    waiting.delay(7_000_000, (np.zeros(0, dtype=np.int64), np.zeros((0, 6))))
+    waiting.delay(7_000_000, (np.zeros(0, dtype=np.int64), np.zeros((0, 6))), 2e-3)
     assert len(waiting.frames) == len(plain) - 1  # no sample comes after the last
     for before, after in zip(plain[1:], waiting.frames[1:], strict=False):
         assert after.time_ns == before.time_ns + 7_000_000
         assert after.imu_times_ns[-1] == after.time_ns
+        assert after.delay_s == 2e-3
         assert np.all(np.diff(after.imu_times_ns) > 0)

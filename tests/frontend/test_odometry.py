@@ -10,6 +10,7 @@ import pytest
 from maplab_py.errors import FlagError, MapError, UserError
 from maplab_py.estimation.window.frame import Motion, WindowFrame
 from maplab_py.estimation.window.smoother import FixedLagSmoother
+from maplab_py.frontend.image_delay import DelayMonitor
 from maplab_py.frontend.odometry import Odometry
 from maplab_py.frontend.odometry_options import HealthOptions, OdometryOptions
 from maplab_py.frontend.odometry_update import OdometryStatus, OdometryUpdate
@@ -377,6 +378,27 @@ def test_a_wrong_mounting_is_estimated_and_given_to_the_sensors() -> None:
     assert np.degrees(off[:, 3:].max()) < 0.5
     assert position_errors(start.truth, states.time_ns, states.T_M_I)[-1] < 0.1
     assert mended.cameras[0].image_delay_s == 0.0
+
+
+@pytest.mark.parametrize("known_s", [0.0, 0.004, 0.02])
+def test_a_measured_delay_stays_applied_where_cameras_have_known_delays(known_s: float) -> None:
+    device, events, start = events_of(cameras=1, is_perfect=True)
+    camera = dataclasses.replace(device.cameras[0], image_delay_s=known_s)
+    late = device.with_cameras((camera,), device.T_I_C)
+    odometry = Odometry(late, make_starter=start)
+    odometry._delays = DelayMonitor(late)
+    odometry._delays.applied_s = 0.02
+    early = [
+        dataclasses.replace(event, time_ns=event.time_ns - 20_000_000)
+        if isinstance(event, TrackedFrameSet)
+        else event
+        for event in events
+    ]
+    updates = pushed(odometry, early[:200])
+    states, newest = states_of(updates), updates[-1].window
+    assert position_errors(start.truth, states.time_ns, states.T_M_I).max() < 2e-3
+    assert newest is not None
+    assert newest.median_error_px < 0.01
 
 
 def test_only_what_is_named_is_estimated() -> None:

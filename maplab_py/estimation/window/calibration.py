@@ -300,7 +300,7 @@ class FrameTimes:
     """Times of the images of F frames, and rates at which the body turned."""
 
     rate_I: F64  # (F, 3) angular velocity as measured [rad/s]
-    delay_s: F64  # (F,) by which the frame's time differs from the stamps of its images
+    delay_s: F64  # (F,) of the frames, see `WindowFrame`
 
     def twist(self, states: WindowStates) -> F64:
         """Return velocity and angular velocity in I, and the delays, as kernels read them (F, 7)."""

@@ -44,7 +44,7 @@ class WindowFrame:
     uv_px: F64  # (K, 2) of the distorted image
     sigma_px: F64  # (K,)
     motion: Motion = Motion.MOVING
-    delay_s: float = 0.0  # by which its time differs from the stamps of its images
+    delay_s: float = 0.0  # by which its time differs from that which lateness of images counts from
     failed: ImuPart = NO_PART  # parts of the IMU whose samples say next to nothing
 
     def __post_init__(self) -> None:
