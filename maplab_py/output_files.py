@@ -127,7 +127,7 @@ def check_creatable(path: Path) -> None:
         UserError: A folder above it is a file, or the user must not write into it.
     """
     above = next(folder for folder in path.absolute().parents if os.path.lexists(folder))
-    if not above.is_dir():
+    if not os.path.isdir(above):
         raise UserError(f"{path}: cannot be written ({above} is not a folder)")
     if not os.access(above, os.W_OK | os.X_OK):
         raise UserError(f"{path}: cannot be written (no permission to write into {above})")

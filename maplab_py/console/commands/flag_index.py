@@ -45,21 +45,23 @@ class Flags(Mapping[str, Flag]):
         return len(self._names)
 
 
-def kept_index(plugins: Iterable[str], make: Callable[[], Index]) -> Index:
+def kept_index(plugins: Iterable[str], make: Callable[[], tuple[Index, bool]]) -> Index:
     """Return the index of built-in plugins as it was kept for these sources; else make and keep it.
 
     Args:
         plugins: Names of the plugins.
-        make: Makes the index, for which it imports all plugins.
+        make: Makes the index, for which it imports all plugins; tells whether none of them is broken.
     """
     path = cache_root() / "flags" / f"{_state_of_sources(plugins)}.json"
     try:
         index = json.loads(path.read_text(encoding="utf-8"))
-        if isinstance(index, dict):
+        if isinstance(index, dict) and all(isinstance(names, list) for names in index.values()):
             return index
     except (OSError, ValueError):
         pass
-    index = make()
+    index, is_whole = make()
+    if not is_whole:
+        return index
     with contextlib.suppress(OSError, MaplabError):  # else it is made again each time
         cache_root().mkdir(mode=0o700, parents=True, exist_ok=True)
         write_file(path, [json.dumps(index).encode()])
@@ -76,6 +78,7 @@ def _state_of_sources(plugins: Iterable[str]) -> str:
         for folder in spec.submodule_search_locations or () if spec is not None else ():
             for where, _, names in os.walk(folder):
                 for name in (name for name in names if name.endswith(".py")):
-                    stat = os.stat(path := os.path.join(where, name))
-                    state.append(f"{path} {stat.st_size} {stat.st_mtime_ns}")
+                    with contextlib.suppress(OSError):  # a link of an editor that leads nowhere
+                        stat = os.stat(path := os.path.join(where, name))
+                        state.append(f"{path} {stat.st_size} {stat.st_mtime_ns}")
     return hashlib.sha256("\n".join(sorted(state)).encode()).hexdigest()[:32]

@@ -16,7 +16,7 @@ from maplab_py.console.commands.command import COMMAND_ATTRIBUTE, Command
 from maplab_py.console.commands.flag_index import Flags, Index, kept_index
 from maplab_py.console.commands.flags import CONSOLE_FLAGS, Flag
 from maplab_py.console.commands.suggest import unknown
-from maplab_py.errors import UserError
+from maplab_py.errors import FlagError, UserError
 from maplab_py.memory import collection_paused
 
 ENTRY_POINT_GROUP = "maplab_py.plugins"
@@ -134,19 +134,26 @@ class Registry:
         loaded = {name: flag for command in commands for name, flag in command.flags.items()}
         if not self._pending:
             return CONSOLE_FLAGS | loaded
-        return Flags({*self._flag_index, *loaded}, lambda name: self.flags_named(name)[-1][1])
+        return Flags({*self._flag_index, *loaded}, self._flag)
+
+    def _flag(self, name: str) -> Flag:
+        named = self.flags_named(name)
+        if not named:
+            raise FlagError(f"--{name}: the plugin of its commands is not available (see: plugins)")
+        return named[-1][1]
 
     @functools.cached_property
     def _flag_index(self) -> Index:
         """Names of the built-in plugins of every flag; they are imported only where no index is kept."""
         return kept_index([n for n in self._order if n in self._built_in], self._make_index)
 
-    def _make_index(self) -> Index:
+    def _make_index(self) -> tuple[Index, bool]:
         index: dict[str, list[str]] = {}
-        for plugin in (plugin for plugin in self.plugins if plugin.name in self._built_in):
+        plugins = [plugin for plugin in self.plugins if plugin.name in self._built_in]
+        for plugin in plugins:
             for name in {name: None for c in plugin.commands for name in c.flags}:
                 index.setdefault(name, []).append(plugin.name)
-        return index
+        return index, not any(plugin.error for plugin in plugins)
 
     def add(self, command: Command, plugin: Plugin) -> None:
         """Register a command; a name that is in use stays with its first owner."""

@@ -1,7 +1,8 @@
 """Errors of a chain of commands that can be seen before anything of it runs."""
 
+import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from maplab_py.console.commands import flags, lines
@@ -16,6 +17,8 @@ from maplab_py.output_files import check_creatable, check_writable
 LEAVE = ("q", "quit", "exit")
 _MAKERS_OF_ANY_KEY = ("recover",)
 """Commands whose maps have keys that their lines do not name."""
+_NO_KEY = re.compile(r"[^A-Za-z0-9_-]+")
+"""Characters between the words that keys of maps may be made of."""
 _MAX_DEPTH = 8
 
 
@@ -54,7 +57,9 @@ class _Checker:
         self._aliases = dict(session.aliases)
         self._settings = session.settings.copy()
         self._written = written
-        self._keys = set(session.maps.keys)  # of maps, and words that commands may make keys of
+        self._keys = set(
+            session.maps.keys
+        )  # of maps, and beginnings of keys that commands may make
         self._makes_any_key = False
         self._runs_shell = False  # a shell command can make any file
 
@@ -109,9 +114,14 @@ class _Checker:
                 raise UserError(f"{call.command.name}: --{name}={value}: {fault}")
         if not self._runs_shell:
             self._check_output(call)
-        self._written += [value for value in call.values.values() if isinstance(value, Path)]
-        texts = (*call.given.values(), *call.values.values(), call.command.name)
-        self._keys.update(part for text in texts for part in re.split(r"[/,=]", str(text)) if part)
+        defaults = {name: flag.default for name, flag in call.command.flags.items()}
+        paths = [p for p in (defaults | dict(call.values)).values() if isinstance(p, Path)]
+        self._written += paths
+        names = [
+            os.path.basename(os.path.realpath(path)) for path in paths
+        ]  # of what links lead to
+        texts = (*call.given.values(), *call.values.values(), call.command.name, *names)
+        self._keys.update(word for text in texts for word in _NO_KEY.split(str(text)) if word)
         self._makes_any_key |= call.command.name in _MAKERS_OF_ANY_KEY
         self._makes_any_key |= not self._registry.is_built_in(call.command)
 
@@ -122,11 +132,11 @@ class _Checker:
             return ""
         if not is_key:
             return fault
-        parents = [folder for folder in self._written if folder.is_dir()]
+        known = tuple(word.lstrip("_") for word in self._keys)
         if (
             self._makes_any_key
-            or any(key.startswith(key_of_folder(Path(known))) for known in self._keys)
-            or any(key == key_of_folder(child) for folder in parents for child in folder.iterdir())
+            or key.lstrip("_").startswith(known)
+            or any(key == key_of_folder(folder) for folder in _folders_below(self._written))
         ):
             return ""
         return "there is no such map, neither in memory nor on disk"
@@ -136,9 +146,9 @@ class _Checker:
         path = call.values.get(call.command.output)
         if not isinstance(path, Path) or any(_is_related(path, other) for other in self._written):
             return
-        if path.is_file() and "overwrite" in call.command.flags:
+        if os.path.isfile(path) and "overwrite" in call.command.flags:
             check_writable(path, overwrite=bool(call.values.get("overwrite")))
-        else:
+        elif not os.path.lexists(path):
             check_creatable(path)
 
     def _follow(self, call: Call, words: Sequence[str]) -> None:
@@ -165,6 +175,14 @@ def _fault(path: Path) -> str:
         return "" if path.exists() else "there is no such file or folder"
     except OSError as error:
         return error.strerror or "it cannot be read"
+
+
+def _folders_below(parents: list[Path]) -> Iterator[Path]:
+    """Iterate over the folders below some, whose names maps may get as keys."""
+    for parent in set(parents):
+        for where, names, _ in os.walk(parent):
+            names[:] = (name for name in names if not name.startswith("."))
+            yield from (Path(where, name) for name in names)
 
 
 def _is_related(path: Path, other: Path) -> bool:

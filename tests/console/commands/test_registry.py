@@ -1,6 +1,7 @@
 """Typed text split into commands, and plugins that are found, broken, clashing or restricted."""
 
 import ast
+import functools
 import itertools
 import shlex
 import sys
@@ -15,8 +16,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from maplab_py.console.commands import schema
+from maplab_py.console.commands import flag_index, schema
+from maplab_py.console.commands import registry as registry_module
 from maplab_py.console.commands.command import describe
+from maplab_py.console.commands.flag_index import Index, kept_index
 from maplab_py.console.commands.lines import scan, split_commands
 from maplab_py.console.commands.registry import (
     BUILT_IN,
@@ -26,6 +29,7 @@ from maplab_py.console.commands.registry import (
     Registry,
     load_registry,
 )
+from maplab_py.console.session.settings import Layer, Settings
 from maplab_py.errors import FlagError, UserError
 from maplab_py.plugin import CommandContext, Message, command
 from tests.support.own_process import in_own_process
@@ -133,6 +137,46 @@ def test_a_duplicate_command_stays_with_the_first_and_names_both(
         "command 'same' of plugin bbb is taken by plugin aaa, which keeps it",
         "command 's' of plugin ccc is taken by plugin aaa, which keeps it",
     ]
+
+
+def test_an_index_of_flags_is_kept_unless_a_plugin_is_broken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    package = tmp_path / "maplab_test_package"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    (package / ".#locked.py").symlink_to("nowhere")  # as editors lock a file
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(flag_index, "_PACKAGES", (package.name,))
+    monkeypatch.setenv("MAPLAB_CACHE_DIR", str(tmp_path / "cache"))
+    index, made = {"rate": ["a"]}, list[bool]()
+
+    def make(*, is_whole: bool = True) -> tuple[Index, bool]:
+        made.append(is_whole)
+        return index, is_whole
+
+    for is_whole in (False, True, True):
+        assert kept_index(["a"], functools.partial(make, is_whole=is_whole)) == index
+    assert made == [False, True]
+    (kept,) = (tmp_path / "cache").rglob("*.json")
+    for number, damaged in enumerate(("{", "[]", '{"rate": null}'), start=3):
+        kept.write_text(damaged)
+        assert kept_index(["a"], make) == index
+        assert len(made) == number
+    (package / "__init__.py").write_text("1")
+    kept_index(["a"], make)
+    monkeypatch.setenv("MAPLAB_CACHE_DIR", str(package / "__init__.py"))  # no folder
+    assert kept_index(["a"], make) == index
+    assert len(made) == 7
+
+
+def test_a_flag_of_a_plugin_that_broke_since_is_an_error_of_one_line(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(registry_module, "kept_index", lambda *_: {"rate": ["bad"]})
+    bad = EntryPoint("bad", f"{BUILT_IN}no_such_module", ENTRY_POINT_GROUP)
+    with pytest.raises(FlagError, match="--rate: the plugin of its commands is not available"):
+        Settings(Registry([bad])).assign(["--rate=1"], Layer.SET, "set")
 
 
 def test_the_environment_restricts_what_loads(

@@ -376,8 +376,10 @@ def test_a_folder_without_permission_is_named(
     def refuse(path: Path) -> bool:
         raise PermissionError(13, "Permission denied", str(path))
 
-    monkeypatch.setattr(Path, "exists", refuse)
-    assert Runner(session, ConsoleTerminal()).run_script("load locked/map") == Status.USER_ERROR
+    for name in ("exists", "is_file", "is_dir"):
+        monkeypatch.setattr(Path, name, refuse)
+    text = "load locked/map; recording_info .; select_map none; save_view locked/map.png"
+    assert Runner(session, ConsoleTerminal()).run_script(text) == Status.USER_ERROR
     assert "--map_folder=locked/map: Permission denied" in capsys.readouterr().err
 
 
@@ -402,7 +404,11 @@ SOUND = [
     "simulate --map_folder=sim; load sim/session_1",
     "visualize; why $pick",
     "create_new_map a; localize --localization_map=a; select_map a",
-    "load_all --maps_folder=.; select_map sub_1",
+    "load_all --maps_folder=.; select_map sub_1; load_all sub.1; select_map core",
+    "load link; select_map inner; import_g2o graph.g2o.gz; select_map graph",
+    "import_trajectory graph.g2o.gz --as=mission; select_map graph",
+    "demo; load maplab_demo",
+    "watch --command='copy_map b' --repetitions=1; select_map b",
     "split_map; rename_map whole; load_all .; select_map whole_cell_1; recover; merge_map other",
     "save_view new/folder/map.png; save_view new/folder/map.png --overwrite",
 ]
@@ -415,7 +421,9 @@ def test_what_earlier_commands_make_is_there(
     monkeypatch.chdir(tmp_path)
     if text.startswith("set"):
         (tmp_path / "nosuch.csv").touch()
-    (tmp_path / "sub.1").mkdir()
+    (tmp_path / "sub.1" / "inner" / "core").mkdir(parents=True)
+    (tmp_path / "link").symlink_to("sub.1/inner")
+    (tmp_path / "graph.g2o.gz").touch()
     assert check_commands(text, session) == []
 
 
