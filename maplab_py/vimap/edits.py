@@ -35,14 +35,14 @@ def remove_missions(vi_map: VIMap, missions: ArrayLike) -> VIMap:
     """Remove missions with their vertices, edges, resources and landmarks.
 
     Landmarks that another mission observes are stored in their first observer there and keep their
-    position in G. Loop closure edges to the removed missions are removed. Texts, as the records of updates
-    are, go to the newest mission that stays.
+    position in G. Loop closure edges to the removed missions are removed. Their texts, as the records of
+    updates are, go to the newest mission that stays.
 
     Args:
         missions: Mission rows or a mask (M,).
     """
     removed = as_mask(missions, len(vi_map.missions))
-    vi_map = with_texts_on_newest(vi_map, ~removed)
+    vi_map = with_texts_on_newest(vi_map, ~removed, of=removed)
     vertex_kept = ~removed[vi_map.vertices.mission]
     homeless = np.flatnonzero(~vertex_kept[vi_map.landmarks.vertex])
     store = stores_for(vi_map, homeless, vertex_kept, same_mission=False)
@@ -57,9 +57,10 @@ def texts_of_missions(vi_map: VIMap) -> I64:
     return np.flatnonzero((table.type == _TEXT) & (table.owner_kind == ResourceOwner.MISSION))
 
 
-def with_texts_on_newest(vi_map: VIMap, missions: Mask) -> VIMap:
-    """Return the map with the texts of all missions on the newest of some missions (M,)."""
+def with_texts_on_newest(vi_map: VIMap, missions: Mask, of: Mask | None = None) -> VIMap:
+    """Return the map with the texts of all missions, or of some (M,), on the newest of some missions (M,)."""
     rows = texts_of_missions(vi_map)
+    rows = rows if of is None else rows[of[vi_map.resources.owner[rows]]]
     if len(rows) == 0 or not missions.any():
         return vi_map
     owner = vi_map.resources.owner.copy()

@@ -77,21 +77,23 @@ def with_record(
         before: The map before the update.
         after: The map after it.
         report: Of the update.
-        map_folder: Folder of the map, whose records are read.
+        map_folder: Folder of the map, whose records are read; those that are damaged stay as they are.
 
     Raises:
         UserError: The record cannot be written, as on a full disk.
-        MapError: A record of the map is missing or damaged.
     """
     before = stored_order(before)
-    known = _records(after, map_folder)
+    known = _records(after, map_folder, skip_damaged=True)
     came_with = IdIndex(before.resources.id).rows(after.resources.id) < 0  # the session
     mine = [record for record, row in known if not came_with[row]]
     number = max((record.number for record in mine), default=0) + 1
     facts, states = UpdateRecord.of(report), (checksum(before), checksum(after))
     new = Record(number, (facts,), *states, difference(before, after))
     chain = _chain(mine, new.before)
-    merged = _merged(chain, before) if len(chain) + 1 > _STATES else ()
+    try:
+        merged = _merged(chain, before) if len(chain) + 1 > _STATES else ()
+    except MapError:  # older states cannot be made again
+        merged, chain = (), chain[:_RECENT]
     written, removed = [], np.zeros(len(after.resources), dtype=np.bool_)
     for record, row in known:
         lasting: Record | None = record
@@ -146,28 +148,41 @@ def records(vi_map: VIMap, map_folder: Path | None) -> list[Record]:
     return [record for record, _ in _records(vi_map, map_folder)]
 
 
-def _records(vi_map: VIMap, map_folder: Path | None) -> list[tuple[Record, int]]:
+def _records(
+    vi_map: VIMap, map_folder: Path | None, *, skip_damaged: bool = False
+) -> list[tuple[Record, int]]:
     """Return the records and the resources (rows) that hold them."""
     result = []
     for row in edits.texts_of_missions(vi_map).tolist():
-        path = resource_path(vi_map, row, map_folder or Path())
         try:
-            mark, _, rest = path.read_bytes().partition(b"\n")
-            if mark != _MARK.encode():
-                continue
-            head, content = (rest.decode() + "\n").split("\n")[:2]
-            number, facts, before, after = json.loads(head)
-            updates = tuple(UpdateRecord(**fact) for fact in facts)
-            for update in updates:
-                datetime.fromisoformat(update.date)
-            result.append((Record(
-                int(number), updates, str(before), str(after), base64.b85decode(content)
-            ), row))  # fmt: skip
-        except OSError as error:
-            raise MapError(f"{path}: the record cannot be read ({error.strerror})") from None
-        except (ValueError, TypeError, RecursionError):
-            raise MapError(f"{path}: the record of an update is damaged") from None
+            record = _read(resource_path(vi_map, row, map_folder or Path()))
+        except MapError:
+            if not skip_damaged:
+                raise
+            continue
+        if record is not None:
+            result.append((record, row))
     return sorted(result, key=lambda item: item[0].number)
+
+
+def _read(path: Path) -> Record | None:
+    """Return the record in a file; None if it holds another text."""
+    try:
+        mark, _, rest = path.read_bytes().partition(b"\n")
+        if mark != _MARK.encode():
+            return None
+        head, content = (rest.decode() + "\n").split("\n")[:2]
+        number, facts, before, after = json.loads(head)
+        updates = tuple(UpdateRecord(**fact) for fact in facts)
+        if not updates:
+            raise ValueError
+        for update in updates:
+            datetime.fromisoformat(update.date)
+        return Record(int(number), updates, str(before), str(after), base64.b85decode(content))
+    except OSError as error:
+        raise MapError(f"{path}: the record cannot be read ({error.strerror})") from None
+    except (ValueError, TypeError, RecursionError):
+        raise MapError(f"{path}: the record of an update is damaged") from None
 
 
 def map_at(vi_map: VIMap, map_folder: Path | None, end: str) -> tuple[VIMap, UpdateRecord | None]:

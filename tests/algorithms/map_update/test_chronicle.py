@@ -29,6 +29,7 @@ from maplab_py.storage.extension_fields import PACKED, unpacked
 from maplab_py.storage.native import load_map, save_map
 from maplab_py.storage.resources.files import missing_files
 from maplab_py.storage.resources.new import NewResources
+from maplab_py.storage.resources.store import resource_path
 from maplab_py.vimap import ResourceOwner, VIMap, without_resources
 from maplab_py.vimap.edits import remove_landmarks, remove_missions
 from tests.algorithms.map_update.test_update import first, sessions, updated
@@ -187,6 +188,41 @@ def test_a_map_keeps_few_states_and_all_facts() -> None:
     after = chronicle.stored_order(remove_landmarks(changed, np.arange(3)))
     later = chronicle.records(chronicle.with_record(changed, after, report), None)
     assert [bool(record.differences) for record in later] == [False] * 12 + [True]
+
+
+def test_updates_go_on_after_damage_of_records() -> None:
+    vi_map, report = updated()
+    vi_map = chronicle.stored_order(without_resources(vi_map, vi_map.resources.type >= 0))
+    for _ in range(12):
+        after = chronicle.stored_order(remove_landmarks(vi_map, np.arange(3)))
+        vi_map = chronicle.with_record(vi_map, after, report)
+    after = chronicle.stored_order(remove_landmarks(vi_map, np.arange(3)))
+    oldest = chronicle.records(vi_map, None)[0]
+    paths = [resource_path(vi_map, row, Path()) for row in range(len(vi_map.resources))]
+    (file,) = (path for path in paths if path.read_bytes() == oldest.content())
+    file.write_bytes(dataclasses.replace(oldest, differences=b"x").content())
+    known = chronicle.records(chronicle.with_record(vi_map, after, report), None)
+    assert [bool(record.differences) for record in known] == [False] * 8 + [True] * 5
+    facts = chronicle.Record(1, (), oldest.before, oldest.after, b"x").content()
+    for content in (facts, b"maplab-py update 2\nx"):
+        file.write_bytes(content)
+        again = chronicle.with_record(vi_map, after, report)
+        assert len(again.resources) == 13
+        with pytest.raises(MapError, match=f"{file}: the record of an update is damaged"):
+            chronicle.records(again, None)
+
+
+def test_texts_of_other_missions_stay_with_them() -> None:
+    vi_map = updated()[0]
+    new = NewResources(seed=b"texts")
+    missions = np.arange(len(vi_map.missions))
+    rows = [new.add(11, b"text %d" % mission) for mission in missions]
+    vi_map = without_resources(vi_map, vi_map.resources.type >= 0)
+    vi_map = new.attached(vi_map, rows, missions, ResourceOwner.MISSION)
+    assert len(missions) > 1
+    newest = len(missions) - 1
+    shorter = remove_missions(vi_map, [newest])
+    assert shorter.resources.owner.tolist() == [*range(newest), newest - 1]
 
 
 def test_readers_of_the_original_layout_skip_what_updates_add(tmp_path: Path) -> None:
