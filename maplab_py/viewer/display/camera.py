@@ -34,6 +34,8 @@ Window = tuple[float, float, float]
 _WIDE: Window = (_ASPECT, _FREE, 1.0)
 _GIVEN = 64
 """Views of late that pages were given."""
+_LEAST_FAR_M = 100.0
+"""Distance up to which pages show a map that has just begun: they may be moved before it grows."""
 _LEAST_SHARE, _ROOM = 0.5, 1.25
 """Share of the picture below which a map is moved closer to; room that a map gets to grow."""
 
@@ -135,7 +137,9 @@ class Cameras:
         """Move cameras, unless the user has, when the map outgrows their picture or is small in it."""
         if _LEAST_SHARE <= share_of_picture(extent, *self._view) <= 1.0:
             return
-        clients = self._server.get_clients().values()
+        clients = list(self._server.get_clients().values())
+        for client in clients:
+            _set_planes(client.camera, extent)
         self._move(extent, [client for client in clients if self._is_unmoved(client)], room=_ROOM)
 
     def aim_new_pages(self, extent: Extent) -> None:
@@ -209,8 +213,7 @@ def _look(camera: Any, extent: Extent, view: tuple[F64, F64]) -> None:
     camera.position = position
     camera.look_at = target
     camera.fov = FIELD_OF_VIEW_RAD
-    camera.near = max(1e-3, 2e-4 * extent.radius_m)
-    camera.far = 100.0 * extent.radius_m
+    _set_planes(camera, extent)
 
 
 def approach(camera: Any, p: F64, distance_m: float) -> None:
@@ -265,5 +268,9 @@ def aim_initially(camera: Any, extent: Extent, view: tuple[F64, F64]) -> None:
     camera.look_at = tuple(target.tolist())
     camera.up = (0.0, 0.0, 1.0)
     camera.fov = FIELD_OF_VIEW_RAD
+    _set_planes(camera, extent)
+
+
+def _set_planes(camera: Any, extent: Extent) -> None:
     camera.near = max(1e-3, 2e-4 * extent.radius_m)
-    camera.far = 100.0 * extent.radius_m
+    camera.far = max(_LEAST_FAR_M, 100.0 * extent.radius_m)

@@ -45,6 +45,8 @@ def test_pages_follow_a_map_that_grows_until_they_are_moved() -> None:
         on_client_connect=lambda _: None,
     )
     cameras = Cameras(server)
+    cameras.show_all(extent(0.02))  # before the device moves
+    assert pages[7].camera.far >= 100.0
     cameras.show_all(extent(1.0))
     pages[7].camera.position = np.add(
         pages[7].camera.position, [0.5, 0.0, 0.0]
@@ -65,6 +67,7 @@ def test_pages_follow_a_map_that_grows_until_they_are_moved() -> None:
     pages[9].camera.position = np.array(server.initial_camera.position)  # opened since
     cameras.keep_in_view(extent(30.0))
     np.testing.assert_array_equal(pages[9].camera.position, pages[3].camera.position)
+    assert pages[7].camera.far == pages[3].camera.far == pytest.approx(3000.0)
     cameras.show_all(extent(1.0))  # another map is for all
     np.testing.assert_array_equal(pages[7].camera.position, pages[3].camera.position)
 
