@@ -69,11 +69,12 @@ class MapBuilder:
 
         Args:
             device: The sensors with other figures; None = as before. With another calibration they need
-                other ids, so that both are in the map.
+                other ids, so that both are in the map; under the same ids they replace those before.
         """
-        self._device = device or self._device
+        self._device = new = device or self._device
         self._missions.append(RecordedMission())
-        self._devices.append(self._device)
+        ids = new.imu_id, new.rig_id
+        self._devices = [new if (d.imu_id, d.rig_id) == ids else d for d in self._devices] + [new]
 
     def calibrate(self, device: RecordedSensors) -> None:
         """Take the sensors with another calibration, for all missions."""
@@ -188,12 +189,15 @@ class MapBuilder:
 
     def ties(self) -> list[Tie | None]:
         """Return how each mission of the map is tied to the one before; None = it is not, as the first."""
-        imu, missions = self._device.imu, self._used_missions()
-        assert imu is not None
-        return [None, *(a.tie_to(b, imu) for a, b in itertools.pairwise(missions))]
+        result: list[Tie | None] = [None]
+        for (a, device), (b, _) in itertools.pairwise(self._used_missions()):
+            assert device.imu is not None
+            result.append(a.tie_to(b, device.imu))
+        return result
 
-    def _used_missions(self) -> list[RecordedMission]:
-        return [mission for mission in self._missions if len(mission) >= _MIN_VERTICES]
+    def _used_missions(self) -> list[tuple[RecordedMission, RecordedSensors]]:
+        pairs = zip(self._missions, self._devices, strict=True)
+        return [(mission, device) for mission, device in pairs if len(mission) >= _MIN_VERTICES]
 
     def make_map(self) -> VIMap:
         """Return the map so far, without landmarks; missions of fewer than two vertices are left out.
@@ -203,14 +207,13 @@ class MapBuilder:
         Raises:
             EstimationError: No mission has two vertices.
         """
-        missions = self._used_missions()
-        devices = [self._devices[self._missions.index(mission)] for mission in missions]
-        if not missions:
+        used = self._used_missions()
+        if not used:
             raise EstimationError(
                 "there is no map: the odometry has estimated fewer than two vertices"
             )
-        result = mission_map(devices[0], missions[0], self._images)
-        for mission, device, tie in zip(missions[1:], devices[1:], self.ties()[1:], strict=True):
+        result = mission_map(used[0][1], used[0][0], self._images)
+        for (mission, device), tie in zip(used[1:], self.ties()[1:], strict=True):
             part = mission_map(device, mission, self._images)
             result = merge.stack(result, part) if tie is None else tied(result, part, tie)
         return result

@@ -169,6 +169,7 @@ class Mapping:
         if self.builder is not None:
             self.builder.refine(self.odometry.window_states())
         self.odometry.recalibrate(device)
+        self.statistics.expect_start("another calibration")
 
     @property
     def recording_notes(self) -> tuple[str, ...]:

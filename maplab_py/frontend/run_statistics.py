@@ -93,6 +93,10 @@ class RunStatistics:
             self.distance_m += float(np.linalg.norm(p - self._last_p[1]))
         self._last_p = update.mission, p
 
+    def expect_start(self, reason: str) -> None:
+        """Count the next mission as one that begins for a reason, without a wait."""
+        self._reason, self._lost_ns = reason, self.last_ns
+
     def add_stage(self, stage: str, spent_ms: float) -> None:
         """Count the time of a stage that follows the odometry."""
         self.stage_ms[_STAGES.index(stage) - len(_STAGES)] += spent_ms

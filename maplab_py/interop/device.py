@@ -170,6 +170,8 @@ def _camera_id(camera: Camera) -> str:
     size = f"{camera.width_px} {camera.height_px} {camera.time_offset_ns} {camera.topic}"
     if camera.line_delay_ns:
         size += f" {camera.line_delay_ns}"
+    if camera.image_delay_s:
+        size += f" {camera.image_delay_s:.12g} s"
     numbers = np.concatenate([camera.intrinsics, camera.distortion_parameters]).tobytes().hex()
     return _digest(camera.projection.value, camera.distortion.value, size, numbers)
 

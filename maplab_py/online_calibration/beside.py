@@ -44,7 +44,6 @@ class CalibrationBeside:
         self._mission, self._begin_ns, self._session = -1, 0, ""
         self._worker: _Worker | None = None
         self._device: RecordedSensors | None = None  # as segments are recorded now
-        self._switches: list[str] = []
         self._held: Piece | None = None  # the newest segment, while the odometry may still diverge
 
     def after_frame(self, update: OdometryUpdate, mapping: Mapping) -> None:
@@ -109,7 +108,7 @@ class CalibrationBeside:
         self._device = _calibrated(self._device, read_calibration(self._options.proposal))
         mapping.recalibrate(self._device.renamed())
         reason = contradicted(worker.newest) or "the calibration was not known as well as wanted"
-        self._switches.append(
+        mapping.statistics.notes.append(
             f"{reason}; a new mission with another calibration since "
             f"{mapping.statistics.elapsed_s:.1f} s: {_changed(worker.newest.proposal)}"
         )
@@ -156,7 +155,6 @@ class CalibrationBeside:
                 self._cut(recorded, recorded.last_ns, OPTIONS.segment_keyframes // 2 + 1)
         self._hand_on(None)
         notes = mapping.statistics.notes
-        notes += self._switches
         if self._worker is None:
             notes.append("self-calibration: no segment of the recording is long enough")
             return

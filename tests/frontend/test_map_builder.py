@@ -11,19 +11,26 @@ from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.errors import EstimationError, FlagError
 from maplab_py.frontend.map_builder import MapBuilder
+from maplab_py.frontend.recorded_mission import RecordedMission
 from maplab_py.frontend.run_options import MapBuilderOptions
 from maplab_py.interop.recordings.map_replay import MapRecording
-from maplab_py.interop.recordings.protocol import ImuBatch, TrackedFrame, TrackedFrameSet
+from maplab_py.interop.recordings.protocol import (
+    ImuBatch,
+    RecordedSensors,
+    TrackedFrame,
+    TrackedFrameSet,
+)
 from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate
 from maplab_py.storage.native import load_map, save_map
 from maplab_py.storage.resources.store import ResourceStore
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import VIMap, to_hex
 from maplab_py.vimap.comparison import is_same
 from maplab_py.vimap.consistency import check_consistency
 from maplab_py.vimap.descriptors import FeatureType, types_of
 from maplab_py.vimap.nav_state import NavState
+from maplab_py.vimap.tables import MissionSensor
 from tests.interop.small_map import make_map
 from tests.support.float_features import with_numbers
 
@@ -48,10 +55,12 @@ def states_of(vi_map: VIMap, vertex: int) -> NavState:
     )
 
 
-def rebuilt(vi_map: VIMap, builder: MapBuilder, mission: int = 0) -> None:
+def rebuilt(
+    vi_map: VIMap, builder: MapBuilder, mission: int = 0, device: RecordedSensors | None = None
+) -> None:
     """Add a mission of a map to a builder."""
     recording = MapRecording(vi_map, mission)
-    builder.start_mission()
+    builder.start_mission(device)
     vertex = int(vi_map.vertex_start[mission])
     times_ns, samples = np.zeros(0, dtype=np.int64), np.zeros((0, 6))
     for event in EventStream(recording):
@@ -110,6 +119,27 @@ def test_equal_input_gives_equal_maps_and_other_sessions_other_ids(stereo: VIMap
     result = both.make_map()
     assert both.missions == len(result.missions) == 2
     assert check_consistency(result).failure == ""
+
+
+@pytest.mark.parametrize("is_renamed", [False, True])
+def test_missions_keep_their_sensors_unless_the_ids_are_the_same(
+    monkeypatch: pytest.MonkeyPatch, *, is_renamed: bool
+) -> None:
+    two, used = make_map(), []
+    device = MapRecording(two, 0).device
+    assert device.imu is not None
+    noisy = device.with_imu(dataclasses.replace(device.imu, gyro_noise_density=0.5))
+    noisy = noisy.renamed() if is_renamed else noisy
+    builder = MapBuilder(device, OFTEN)
+    rebuilt(two, builder, 0)
+    rebuilt(two, builder, 1, noisy)
+    ids = builder.make_map().missions.sensor_id[:, int(MissionSensor.IMU)]
+    sensors = builder.make_map().sensors
+    noise = [sensors.imu(to_hex(imu)).gyro_noise_density for imu in ids]
+    assert noise == [device.imu.gyro_noise_density if is_renamed else 0.5, 0.5]
+    monkeypatch.setattr(RecordedMission, "tie_to", lambda *args: used.append(args[-1]))
+    builder.ties()
+    assert used == [device.imu if is_renamed else noisy.imu]
 
 
 def test_landmarks_join_the_cameras_and_can_be_optimised(stereo: VIMap, tmp_path: Path) -> None:

@@ -87,8 +87,9 @@ def test_a_run_goes_on_with_another_calibration_as_a_new_mission() -> None:
                 assert mapping.odometry.can_recalibrate
                 mapping.recalibrate(other)
 
-    start = KnownStart(truth, with_biases=True)
-    mapping = Mapping(recording, observer=Switch(), make_starter=start)
+    mapping = Mapping(
+        recording, observer=Switch(), make_starter=KnownStart(truth, with_biases=True)
+    )
     mapping.run()
     assert mapping.builder is not None
     result, _ = mapping.builder.finish()
@@ -98,10 +99,20 @@ def test_a_run_goes_on_with_another_calibration_as_a_new_mission() -> None:
     rigs = result.missions.sensor_id[:, int(MissionSensor.NCAMERA)]
     used = [result.sensors.camera_rig(to_hex(rig)).cameras[0].intrinsics for rig in rigs]
     np.testing.assert_allclose(used[1], used[0] + 0.5)
+    start = mapping.statistics.starts[1]
+    assert start.reason == "another calibration"
+    assert start.waited_s < 0.2
     # the second mission begins where the first one ends
     p_G = result.T_G_I[:, 4:]
     error = p_G - truth.T_R_B[:, 4:]
     assert np.linalg.norm(np.diff(error, axis=0), axis=1).max() < 0.02
+
+
+def test_sensors_with_another_image_delay_have_other_ids() -> None:
+    device = MapRecording(replayed()[0], 0).device.renamed()
+    late = tuple(dataclasses.replace(camera, image_delay_s=1e-3) for camera in device.cameras)
+    assert device.with_cameras(late, device.T_I_C).renamed().rig_id != device.rig_id
+    assert device.renamed().rig_id == device.rig_id
 
 
 @pytest.mark.parametrize(("estimate", "folder"), [("intrinsics", None), ("none", Path("map"))])
