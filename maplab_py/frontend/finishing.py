@@ -29,6 +29,9 @@ from maplab_py.storage.mission_names import with_folder_names
 from maplab_py.storage.native import DiskCopy, save_map
 from maplab_py.vimap import LandmarkQuality, VIMap
 
+_SAME_DELAY_S = 5e-4
+"""Delays that differ by less count as known."""
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FinishedRun:
@@ -254,11 +257,12 @@ def _calibration_notes(mapping: Mapping) -> list[str]:
             "where a part of the IMU was left out, the map has samples that follow from the images; after "
             "a failure calibrate again (self_calibrate), with a recording of whole sensors"
         )
-    if delays is not None and delays.applied_s:
+    late_s = 0.0 if delays is None else delays.delay_s - delays.known_s
+    if delays is not None and delays.applied_s and abs(late_s) > _SAME_DELAY_S:
         notes.append(
-            f"the images were taken {1e3 * delays.delay_s:+.1f} +- {1e3 * delays.sigma_s:.1f} ms after "
+            f"the images were taken {1e3 * late_s:+.1f} +- {1e3 * delays.sigma_s:.1f} ms after "
             "their stamps, and are used so: put "
-            f"--imu_to_camera_time_offset_ns={_offset_ns(mapping, delays.delay_s)}"
+            f"--imu_to_camera_time_offset_ns={_offset_ns(mapping, late_s)}"
             " to have it from the beginning (--vio_estimate=none keeps the stamps)"
         )
     if odometry.calibration_estimate is not None:

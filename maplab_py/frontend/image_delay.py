@@ -24,7 +24,7 @@ _LARGEST_S = 0.15
 class DelayMonitor:
     """Measures the delay segment by segment, and filters it (a Kalman filter of one state).
 
-    `applied_s` is by how much later than their stamps say images count.
+    `applied_s` is by how much later than their stamps say images count, `known_s` that of the calibration.
     """
 
     def __init__(self, device: RecordedSensors) -> None:
@@ -39,13 +39,13 @@ class DelayMonitor:
         self._imu = device.imu
         self._rays = rays.RayMaker(device.cameras, device.T_I_C)
         middle_s = [c.delay_s(np.array([[0.0, 0.5 * c.height_px]])) for c in device.cameras]
-        self._known_s = float(np.mean(middle_s))
+        self.known_s = float(np.mean(middle_s))
         self.reset()
 
     @property
     def unknown_s(self) -> float:
         """Applied delay of the middle rows without what of it is in the calibration."""
-        return self.applied_s - self._known_s if self.applied_s else 0.0
+        return self.applied_s - self.known_s if self.applied_s else 0.0
 
     @property
     def delay_s(self) -> float:

@@ -5,6 +5,8 @@ import gc
 import time
 import tracemalloc
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +14,7 @@ import pytest
 from maplab_py.array_types import F64
 from maplab_py.errors import Cancelled, EstimationError, FlagError, MapError, UserError
 from maplab_py.frontend import finishing
-from maplab_py.frontend.finishing import finish, scale_verdict
+from maplab_py.frontend.finishing import _calibration_notes, finish, scale_verdict
 from maplab_py.frontend.health import HealthMonitor
 from maplab_py.frontend.mapping import Mapping
 from maplab_py.frontend.odometry_options import OdometryOptions
@@ -429,3 +431,20 @@ def test_a_map_that_contradicts_its_calibration_is_optimised_with_it_free() -> N
     kept = dataclasses.replace(OdometryOptions(), apply_calibration=False)
     mapping.options = dataclasses.replace(mapping.options, odometry=kept)
     assert not any("calibration" in line for line in finish(mapping, wrong.name).report.notes)
+
+
+@pytest.mark.parametrize(
+    ("known_s", "offset"), [(0.0, "=25000000 "), (0.004, "=21000000 "), (0.02, "")]
+)
+def test_the_note_on_a_delay_leaves_out_what_is_in_the_calibration(
+    known_s: float, offset: str
+) -> None:
+    odometry = SimpleNamespace(
+        notes=[], calibration_estimate=None, watch=SimpleNamespace(notes=lambda _: [], failures=[]),
+        delays=SimpleNamespace(applied_s=0.02, delay_s=0.02, known_s=known_s, sigma_s=1e-4),
+        device=SimpleNamespace(cameras=[SimpleNamespace(time_offset_ns=5_000_000)]),
+    )  # fmt: skip
+    mapping: Any = SimpleNamespace(odometry=odometry, statistics=SimpleNamespace(zero_ns=0))
+    notes = _calibration_notes(mapping)
+    assert len(notes) == bool(offset)
+    assert offset in "".join(notes)
