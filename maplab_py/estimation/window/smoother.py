@@ -164,9 +164,10 @@ class FixedLagSmoother:
     def recalibrate(self, cameras: tuple[Camera, ...], T_I_C: F64, imu: Imu) -> None:
         """Express the window with another calibration, of which nothing is estimated; see `WindowChange`."""
         before = self.cameras, self._chain.corrections
-        self.calibration = WindowCalibration.of(cameras, T_I_C)
-        self.cameras = self.calibration.of_kernels(self.calibration.mean)
-        self._back_projection = BackProjection(self._kernels, self.calibration)
+        calibration, seen = WindowCalibration.of(cameras, T_I_C), self.tracks.observations
+        self._back_projection = BackProjection(self._kernels, calibration)
+        self._remove(np.flatnonzero(~self._back_projection.rays(seen.camera, seen.uv_px)[1]))
+        self.calibration, self.cameras = calibration, calibration.of_kernels(calibration.mean)
         self._chain.take_imu(imu)
         change = WindowChange.between(before, (self.cameras, self._chain.corrections))
         window = self._states, self._frames.rate_I, self._chain.mean_samples()
@@ -344,9 +345,8 @@ class FixedLagSmoother:
         return problem, rows, order
 
     def _times(self) -> FrameTimes | None:
-        if not self.calibration.has_lateness:
-            return None
-        return FrameTimes(self._frames.rate_I, self._frames.delay_s)
+        frames = self._frames
+        return FrameTimes(frames.rate_I, frames.delay_s) if self.calibration.has_lateness else None
 
     def _point(self) -> WindowPoint:
         """Return frames and cameras as kernels read them."""

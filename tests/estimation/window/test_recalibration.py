@@ -8,7 +8,7 @@ from maplab_py.array_types import F64
 from maplab_py.estimation.window.options import WindowOptions
 from maplab_py.estimation.window.smoother import FixedLagSmoother
 from maplab_py.geometry import alignment, se3, so3
-from maplab_py.sensors import Camera, Imu
+from maplab_py.sensors import Camera, Distortion, Imu
 from maplab_py.sensors.imu import ImuIntrinsics
 from tests.estimation.window.recordings import SimulatedTracks, scenario, simulated
 
@@ -83,3 +83,20 @@ def test_biases_explain_the_samples_as_before() -> None:
     mean = np.mean([f.accel_gyro[:, :3].mean(axis=0) for f in tracks.frames[10:20]], axis=0)
     expected = (np.diag(imu.intrinsics.T_a) - 1.0) * (mean - before) / np.diag(imu.intrinsics.T_a)
     np.testing.assert_allclose(change, expected, atol=5e-3)
+
+
+def test_keypoints_without_rays_by_the_new_calibration_are_left_out() -> None:
+    tracks = simulated(scenario(duration_s=2.0, stereo=False, keypoints=80))
+    smoother = FixedLagSmoother(tracks.cameras, tracks.T_I_C, tracks.imu, WindowOptions())
+    smoother.start(tracks.frames[0], tracks.start_state(SIGMA))
+    for frame in tracks.frames[1:15]:
+        smoother.add(frame)
+    count = len(smoother.tracks.observations)
+    camera = tracks.cameras[0]
+    bent = np.array([-1.0, 0.0, 0.0, 0.0])  # has no rays far from the centre
+    assert camera.distortion is Distortion.RADTAN
+    camera = dataclasses.replace(camera, distortion_parameters=bent)
+    smoother.recalibrate((camera,), tracks.T_I_C, tracks.imu)
+    assert 0 < len(smoother.tracks.observations) < count
+    assert np.isfinite(smoother.tracks.observations.ray_C).all()
+    assert np.isfinite(smoother.tracks.h).all()
