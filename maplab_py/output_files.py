@@ -142,7 +142,7 @@ def check_writable(path: Path, *, overwrite: bool) -> None:
     """
     try:
         mode = path.stat().st_mode
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         check_creatable(path)
         return
     except OSError as error:
