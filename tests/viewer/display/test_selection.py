@@ -64,9 +64,8 @@ class OpenPage:
     def wait_for_text(self, text: str) -> None:
         self._read(lambda _: text in self.state.html)
 
-    @property
-    def has_marks(self) -> bool:
-        return any(path.startswith("/pick/") for path in self.state.nodes)
+    def wait_for_marks(self) -> None:
+        self._read(lambda _: any(path.startswith("/pick/") for path in self.state.nodes))
 
     def click(self, viewer: Viewer, row: int) -> None:
         """Click a vertex."""
@@ -86,7 +85,7 @@ def test_each_page_has_its_selection_and_the_console_selects_in_all(viewer: View
         viewer.selections.on_pick = told.append
         first.click(viewer, 7)
         first.wait_for_text("8 of 14")
-        assert first.has_marks
+        first.wait_for_marks()
         second.click(viewer, 3)
         second.wait_for_text("4 of 14")
         assert "8 of 14" not in second.state.html
@@ -99,7 +98,8 @@ def test_each_page_has_its_selection_and_the_console_selects_in_all(viewer: View
             page.wait_for_text("12 of 14")
     assert wait_until(lambda: viewer.pages == 0, 20.0)
     with open_page(viewer) as connection:  # it begins with what the console has selected
-        assert OpenPage(viewer, connection, "12 of 14").has_marks
+        OpenPage(viewer, connection, "12 of 14").wait_for_marks()
+    assert wait_until(lambda: not viewer.selections.pages, 20.0)
     viewer.show(Subject(MAP.replace(), "walk"))
     assert viewer.selection.picked is None
 
