@@ -36,8 +36,9 @@ from maplab_py.vision.tracking.views import CameraView, leaders, usable_alone
 
 _ENOUGH_TRACKS, _CONTRADICTED_SHARE = 20, 0.3
 """The turn is looked for in the tracks when so small a share of so many of them agrees with the given one."""
-_DETECTION_FRAMES, _KEPT_SHARE = 2, 0.9
-"""Keypoints are detected in every second frame, and where at most this share of them is left."""
+_DETECTION_FRAMES, _KEPT_SHARE, _FIRST_FRAMES = 2, 0.9, 80
+"""Keypoints are detected in every second frame, where at most this share of them is left, and in the first
+frames, in which the odometry starts: with half of the new tracks it starts later, and less well."""
 _SAME_POINT_PX = 3.0
 """A track of a camera alone ends where a track of its leader arrives; none begins where another one is."""
 
@@ -108,7 +109,7 @@ class FrameTracker:
 
     def reset(self) -> None:
         """Forget all tracks; ids continue."""
-        self._states = None
+        self._states, self._num_frames = None, 0
         self._detected = [np.inf] * len(self._views)
 
     def leave_out(self, cameras: frozenset[int]) -> None:
@@ -256,8 +257,9 @@ class FrameTracker:
         return dataclasses.replace(tracks, distance_m=distance), matches
 
     def _needs_keypoints(self, row: int, tracks: LiveTracks, shared: StereoMatches) -> bool:
-        """Tell whether to detect: in every second frame, in turn with other cameras, and after losses."""
-        is_turn = (self._num_frames + row) % _DETECTION_FRAMES == 0
+        """Tell whether to detect: at first, then in turn with other cameras, and after losses."""
+        is_first = self._num_frames < _FIRST_FRAMES
+        is_turn = is_first or (self._num_frames + row) % _DETECTION_FRAMES == 0
         return is_turn or len(tracks) + len(shared.uv) <= _KEPT_SHARE * self._detected[row]
 
     def _with_new(
