@@ -20,10 +20,8 @@ from maplab_py.interop.recordings.protocol import Recording
 from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.trajectories import read_trajectory
 from maplab_py.sensors import Camera
-from maplab_py.simulation.raw_data import write_raw_data
 from maplab_py.simulation.scenario import SessionOptions
 from maplab_py.simulation.scenario_file import load_scenario
-from maplab_py.simulation.simulate import simulate
 from tests.algorithms.recording_check import faults
 from tests.support.data import shared_data_folder
 
@@ -100,10 +98,7 @@ def rendered(folder: Path, name: str, duration_s: float) -> tuple[strangers.Stra
     """Render a recording unless it is there; return both."""
     stranger = _stranger(name, duration_s)
     target = folder / f"{name.replace(' ', '_')}_{duration_s:g}s"
-    if not (target / "done").exists():
-        write_raw_data(stranger.scenario, simulate(stranger.scenario), target, overwrite=True)
-        (target / "done").touch()
-    return stranger, target / "raw" / "session_1"
+    return stranger, strangers.rendered_once(stranger.scenario, target)
 
 
 def main() -> None:

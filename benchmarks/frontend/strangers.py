@@ -349,11 +349,15 @@ def error_m(vi_map: VIMap, truth: Trajectory) -> float:
 def rendered(folder: Path, seed: int, duration_s: float) -> tuple[Stranger, Path]:
     """Render the recording of a seed unless it is there; return both."""
     stranger = drawn(seed, duration_s)
-    target = folder / f"{seed}_{duration_s:g}s"
+    return stranger, rendered_once(stranger.scenario, folder / f"{seed}_{duration_s:g}s")
+
+
+def rendered_once(scenario: Scenario, target: Path) -> Path:
+    """Render the recording of a scenario's first session unless it is there; return its folder."""
     if not (target / "done").exists():
-        write_raw_data(stranger.scenario, simulate(stranger.scenario), target, overwrite=True)
+        write_raw_data(scenario, simulate(scenario), target, overwrite=True)
         (target / "done").touch()
-    return stranger, target / "raw" / "session_1"
+    return target / "raw" / "session_1"
 
 
 def verdict(faulty: Run, reference: Run) -> str:

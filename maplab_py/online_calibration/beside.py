@@ -16,7 +16,7 @@ from maplab_py.algorithms.recording_check.mending import RecalibratedRecording
 from maplab_py.algorithms.self_calibration.reports import SelfCalibrationReport
 from maplab_py.algorithms.self_calibration.segments.database import read_calibration
 from maplab_py.child_processes import Service, ServiceEnded
-from maplab_py.errors import Cancelled
+from maplab_py.errors import Cancelled, MaplabError
 from maplab_py.frontend.mapping import Mapping
 from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.frontend.recorded_mission import RecordedMission
@@ -44,6 +44,7 @@ class CalibrationBeside:
         self._mission, self._begin_ns, self._session = -1, 0, ""
         self._worker: _Worker | None = None
         self._device: RecordedSensors | None = None  # as segments are recorded now
+        self._can_switch = True  # a proposal that cannot be read is not read again
         self._held: Piece | None = None  # the newest segment, while the odometry may still diverge
 
     def after_frame(self, update: OdometryUpdate, mapping: Mapping) -> None:
@@ -51,6 +52,7 @@ class CalibrationBeside:
         if mapping is not self._mapping:  # the first run, or the same recording once more
             self.close()
             self._mapping, self._mission, self._device = mapping, -1, None
+            self._can_switch = True
         if update.has_diverged:
             self._held = None
         if self._options.apply == "now":
@@ -100,17 +102,25 @@ class CalibrationBeside:
     def _switch(self, update: OdometryUpdate, mapping: Mapping) -> None:
         """Go on with a proposed calibration once the odometry is at a keyframe and sure enough."""
         worker, window = self._worker, update.window
-        if worker is None or worker.is_opening or worker.newest.proposal is None:
+        if not self._can_switch or worker is None or worker.is_opening:
+            return
+        if (proposal := worker.newest.proposal) is None:
             return
         if window is None or not window.is_keyframe or not mapping.odometry.can_recalibrate:
             return
         assert self._device is not None
-        self._device = _calibrated(self._device, read_calibration(self._options.proposal))
+        try:
+            known = read_calibration(self._options.proposal)
+            self._device = _calibrated(self._device, known)
+        except MaplabError as error:
+            mapping.statistics.notes.append(f"the proposed calibration is not used: {error}")
+            self._can_switch = False
+            return
         mapping.recalibrate(self._device.renamed())
         reason = contradicted(worker.newest) or "the calibration was not known as well as wanted"
         mapping.statistics.notes.append(
             f"{reason}; a new mission with another calibration since "
-            f"{mapping.statistics.elapsed_s:.1f} s: {_changed(worker.newest.proposal)}"
+            f"{mapping.statistics.elapsed_s:.1f} s: {_changed(proposal)}"
         )
         worker.open_again(Opening(self._options, self._device))
 
@@ -231,13 +241,14 @@ class _Worker:
                 self.newest = self._service.ask(self._opening, lambda: self._is_closed)
             self._before += self.newest.evaluated if isinstance(request, Opening) else 0
             self.newest = self._service.ask(request, lambda: self._is_closed)
-            self.is_opening &= request is not self._opening
         except Cancelled:
             self._service = None
         except (ServiceEnded, OSError) as error:
             self._service = None
             problem = f"the process beside the odometry has {error}"
             self.newest = dataclasses.replace(self.newest, problem=problem, processor_s=0.0)
+        finally:
+            self.is_opening &= request is not self._opening
 
 
 def _calibrated(device: RecordedSensors, known: SensorSet) -> RecordedSensors:

@@ -27,7 +27,7 @@ __all__ = [
     "with_p_G",
 ]
 
-_TEXT = 11
+TEXT_RESOURCE = 11
 """Number of the resource type of texts."""
 
 
@@ -54,7 +54,9 @@ def remove_missions(vi_map: VIMap, missions: ArrayLike) -> VIMap:
 def texts_of_missions(vi_map: VIMap) -> I64:
     """Return the resources (rows) that are texts of missions."""
     table = vi_map.resources
-    return np.flatnonzero((table.type == _TEXT) & (table.owner_kind == ResourceOwner.MISSION))
+    return np.flatnonzero(
+        (table.type == TEXT_RESOURCE) & (table.owner_kind == ResourceOwner.MISSION)
+    )
 
 
 def with_texts_on_newest(vi_map: VIMap, missions: Mask, of: Mask | None = None) -> VIMap:

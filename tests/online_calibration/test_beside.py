@@ -2,11 +2,14 @@
 
 import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 from maplab_plugins.rovioli import _calibration_beside
 
+from maplab_py.algorithms.self_calibration.reports import SelfCalibrationReport
 from maplab_py.algorithms.self_calibration.segments.database import load_database
 from maplab_py.errors import UserError
 from maplab_py.frontend.localization.options import OnlineLocalizationOptions
@@ -15,8 +18,9 @@ from maplab_py.frontend.odometry_options import OdometryOptions
 from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.frontend.run_options import RunOptions
 from maplab_py.interop.recordings.map_replay import MapRecording
-from maplab_py.online_calibration.beside import CalibrationBeside
+from maplab_py.online_calibration.beside import CalibrationBeside, _Worker
 from maplab_py.online_calibration.options import OnlineCalibrationOptions
+from maplab_py.online_calibration.process import Opening, Status
 from maplab_py.progress import SILENT
 from maplab_py.sensors.sensors_yaml import write_sensors
 from maplab_py.vimap import to_hex
@@ -106,6 +110,46 @@ def test_a_run_goes_on_with_another_calibration_as_a_new_mission() -> None:
     p_G = result.T_G_I[:, 4:]
     error = p_G - truth.T_R_B[:, 4:]
     assert np.linalg.norm(np.diff(error, axis=0), axis=1).max() < 0.02
+
+
+@pytest.mark.parametrize("is_damaged", [False, True])
+def test_a_proposal_is_used_at_once_or_refused_in_one_note(
+    tmp_path: Path, *, is_damaged: bool
+) -> None:
+    vi_map, truth = replayed(cameras=1)
+    recording = MapRecording(vi_map, 0)
+    device = recording.device
+    camera = dataclasses.replace(device.cameras[0], intrinsics=device.cameras[0].intrinsics + 0.5)
+    changed = device.with_cameras((camera,), device.T_I_C)
+    database = tmp_path / "device.segments"
+    options = OnlineCalibrationOptions(is_on=True, database=database, apply="now")
+    text = "# cut" if is_damaged else "# a calibration\n" + write_sensors(changed.sensors)
+    options.proposal.write_text(text)
+    beside = CalibrationBeside(options)
+    openings: list[Opening] = []
+    worker = SimpleNamespace(
+        is_opening=False, newest=Status(), put=lambda _: None, open_again=openings.append
+    )
+
+    class Proposing:
+        def after_frame(self, update: OdometryUpdate, mapping: Mapping) -> None:
+            beside.after_frame(update, mapping)
+            if mapping.statistics.frames == 40:  # the process answers
+                proposal = SimpleNamespace(parameters=())
+                worker.newest = Status(proposal=cast(SelfCalibrationReport, proposal))
+                beside._worker, beside._device = cast(_Worker, worker), device
+            worker.is_opening = bool(openings)
+
+    start = KnownStart(truth, with_biases=True)
+    mapping = Mapping(recording, observer=Proposing(), make_starter=start)
+    mapping.run()
+    assert mapping.builder is not None
+    assert mapping.builder.missions == (1 if is_damaged else 2)
+    notes = [note for note in mapping.statistics.notes if "another calibration" in note]
+    refusals = [note for note in mapping.statistics.notes if "is not used" in note]
+    assert (len(notes), len(refusals)) == ((0, 1) if is_damaged else (1, 0))
+    for opening in openings:
+        np.testing.assert_allclose(opening.device.cameras[0].intrinsics, camera.intrinsics)
 
 
 def test_sensors_with_another_image_delay_have_other_ids() -> None:

@@ -30,8 +30,6 @@ from maplab_py.vimap.descriptors import DescriptorBlock
 from maplab_py.vimap.table import Table, object_column
 from maplab_py.vimap.tables import Resources
 
-_TEXT = 11
-"""Number of the resource type of texts."""
 _MARK = "maplab-py update 2"
 """First line of a record; its facts and its differences follow."""
 _STATES, _RECENT = 12, 4
@@ -107,7 +105,7 @@ def with_record(
             removed[row] = True
             written += [] if lasting is None else [lasting]
     texts = NewResources(seed=after.missions.id.tobytes())
-    rows = [texts.add(_TEXT, record.content()) for record in (*written, new)]
+    rows = [texts.add(edits.TEXT_RESOURCE, record.content()) for record in (*written, new)]
     owner = edits.newest_mission(after, np.ones(len(after.missions), dtype=np.bool_))
     kept = without_resources(after, removed)
     return texts.attached(kept, rows, [owner] * len(rows), ResourceOwner.MISSION)

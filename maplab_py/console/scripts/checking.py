@@ -1,5 +1,6 @@
 """Errors of a chain of commands that can be seen before anything of it runs."""
 
+import itertools
 import os
 import re
 from collections.abc import Iterator, Sequence
@@ -20,6 +21,8 @@ _MAKERS_OF_ANY_KEY = ("recover",)
 _NO_KEY = re.compile(r"[^A-Za-z0-9_-]+")
 """Characters between the words that keys of maps may be made of."""
 _MAX_DEPTH = 8
+_MOST_FOLDERS = 2000
+"""Folders below others that are looked at for maps; in larger trees any map may be."""
 
 
 def check_commands(text: str, session: Session, written: list[Path] | None = None) -> list[str]:
@@ -57,9 +60,7 @@ class _Checker:
         self._aliases = dict(session.aliases)
         self._settings = session.settings.copy()
         self._written = written
-        self._keys = set(
-            session.maps.keys
-        )  # of maps, and beginnings of keys that commands may make
+        self._keys = set(session.maps.keys)  # and beginnings of keys that commands may make
         self._makes_any_key = False
         self._runs_shell = False  # a shell command can make any file
 
@@ -117,9 +118,7 @@ class _Checker:
         defaults = {name: flag.default for name, flag in call.command.flags.items()}
         paths = [p for p in (defaults | dict(call.values)).values() if isinstance(p, Path)]
         self._written += paths
-        names = [
-            os.path.basename(os.path.realpath(path)) for path in paths
-        ]  # of what links lead to
+        names = [os.path.basename(os.path.realpath(path)) for path in paths]  # behind links
         texts = (*call.given.values(), *call.values.values(), call.command.name, *names)
         self._keys.update(word for text in texts for word in _NO_KEY.split(str(text)) if word)
         self._makes_any_key |= call.command.name in _MAKERS_OF_ANY_KEY
@@ -133,11 +132,10 @@ class _Checker:
         if not is_key:
             return fault
         known = tuple(word.lstrip("_") for word in self._keys)
-        if (
-            self._makes_any_key
-            or key.lstrip("_").startswith(known)
-            or any(key == key_of_folder(folder) for folder in _folders_below(self._written))
-        ):
+        if self._makes_any_key or key.lstrip("_").startswith(known):
+            return ""
+        below = list(itertools.islice(_folders_below(self._written), _MOST_FOLDERS))
+        if len(below) == _MOST_FOLDERS or key in map(key_of_folder, below):
             return ""
         return "there is no such map, neither in memory nor on disk"
 

@@ -261,9 +261,10 @@ class Selections:
     def pick(self, drawing: Drawing, picked: Pick, page: Any = None) -> None:
         """Select in a page, None = in all."""
         content = _content(drawing, picked)
-        selections = self._general, *self.pages.values()
-        for selection in selections if page is None else (self.of(page),):
-            selection.show(drawing, picked, content)
+        if page is None:
+            self._in_all(lambda selection: selection.show(drawing, picked, content))
+        else:
+            self.of(page).show(drawing, picked, content)
         self.newest = self._general if page is None else self.of(page)
         self.on_pick(id_of(drawing.vi_map, picked))
 
@@ -279,8 +280,7 @@ class Selections:
 
     def clear(self) -> None:
         """Clear the picks of all pages."""
-        for selection in (self._general, *self.pages.values()):
-            selection.clear()
+        self._in_all(Selection.clear)
         self.newest = self._general
 
     def set_measuring(self, is_measuring: bool) -> None:
@@ -292,8 +292,17 @@ class Selections:
         """Show an image (H, W, 3), or none, in all pages, as of a recording that runs."""
         with self._lock:
             self._live = image
-            for selection in self.pages.values():
-                selection.show_image(image)
+            self._in_all(lambda selection: selection.show_image(image))
+
+    def _in_all(self, change: Callable[[Selection], None]) -> None:
+        """Change the selections of all pages but those that close meanwhile."""
+        change(self._general)
+        for key, selection in tuple(self.pages.items()):
+            try:
+                change(selection)
+            except RuntimeError:  # a widget has gone with its page
+                if key in self._server.get_clients():
+                    raise
 
     def _open(self, page: Any) -> None:
         with self._lock:

@@ -99,7 +99,19 @@ def test_each_page_has_its_selection_and_the_console_selects_in_all(viewer: View
     assert wait_until(lambda: viewer.pages == 0, 20.0)
     with open_page(viewer) as connection:  # it begins with what the console has selected
         OpenPage(viewer, connection, "12 of 14").wait_for_marks()
+    viewer.show(Subject(MAP.replace(), "walk"))
+    assert viewer.selection.picked is None
+
+
+@pytest.mark.filterwarnings("ignore:Queued a FrameMessage on a closed connection")
+def test_a_page_that_closes_while_the_map_is_replaced_is_left_out(viewer: Viewer) -> None:
+    with open_page(viewer) as connection:
+        OpenPage(viewer, connection)
+        leaving = dict(viewer.selections.pages)
     assert wait_until(lambda: not viewer.selections.pages, 20.0)
+    viewer.selections.pages.update(leaving)  # as before its end has been told
+    viewer.select(Pick(Entity.VERTEX, 11, viewer.drawing.p_vertices[11], 0.0))
+    viewer.selections.show_image(np.zeros((8, 8, 3), dtype=np.uint8))
     viewer.show(Subject(MAP.replace(), "walk"))
     assert viewer.selection.picked is None
 
