@@ -134,13 +134,14 @@ def localization_map(vi_map: VIMap, output: OutputOptions, *, progress: Progress
 def _has_wrong_calibration(
     vi_map: VIMap, mapping: Mapping, progress: Progress, is_to_end: Callable[[], bool]
 ) -> bool:
-    """Tell whether the calibration was mended, or is contradicted by the residuals of the map."""
+    """Tell whether the calibration or the stamps were mended, or the residuals of the map contradict them."""
     if is_to_end() or not mapping.options.odometry.apply_calibration:
         return False
     if mapping.odometry.watch.failures:
         return False
     try:
-        return mapping.is_mended or optimization.contradicted_calibration(vi_map, progress)
+        is_mended = mapping.is_mended or _applied_delay_s(mapping) != 0.0
+        return is_mended or optimization.contradicted_calibration(vi_map, progress)
     except EstimationError:  # nothing in the map can be optimised
         return False
 
@@ -257,8 +258,8 @@ def _calibration_notes(mapping: Mapping) -> list[str]:
             "where a part of the IMU was left out, the map has samples that follow from the images; after "
             "a failure calibrate again (self_calibrate), with a recording of whole sensors"
         )
-    late_s = 0.0 if delays is None else delays.delay_s - delays.known_s
-    if delays is not None and delays.applied_s and abs(late_s) > _SAME_DELAY_S:
+    late_s = _applied_delay_s(mapping)
+    if delays is not None and late_s:
         notes.append(
             f"the images were taken {1e3 * late_s:+.1f} +- {1e3 * delays.sigma_s:.1f} ms after "
             "their stamps, and are used so: put "
@@ -277,6 +278,15 @@ def _calibration_notes(mapping: Mapping) -> list[str]:
             )
             notes.append(f"it differs from the file's by more than three deviations: {of_map}")
     return notes
+
+
+def _applied_delay_s(mapping: Mapping) -> float:
+    """Return the delay that the images got beyond the calibration's, 0 if it is as good as none."""
+    delays = mapping.odometry.delays
+    if delays is None or not delays.applied_s:
+        return 0.0
+    late_s = delays.delay_s - delays.known_s
+    return late_s if abs(late_s) > _SAME_DELAY_S else 0.0
 
 
 def _tie_notes(mapping: Mapping) -> list[str]:

@@ -23,7 +23,10 @@ from maplab_py.array_types import F64
 from maplab_py.geometry import so3
 
 _UNITS = {1.0: "rad/s", np.pi / 180.0: "deg/s", 180.0 / np.pi: "rad/s divided by 57.3"}
-_AGREES = 0.5
+_AGREES, _MAY_AGREE, _FITS_PX = 0.5, 0.3, 0.3
+"""Shares of the images' turns that the gyroscope explains where it agrees, and where it does if all
+unknowns together bring the points so near to their epipolar planes: rolling shutters and walls look like
+other turns."""
 _WORSE = 1.15
 _CLEARLY = 0.6
 """Signed axes are exchanged if that leaves at most this share of the deviation."""
@@ -48,7 +51,10 @@ class CameraTurns:
     @property
     def agrees(self) -> bool:
         """Whether the gyroscope explains the turns of the images at some delay."""
-        return self.rate_map is not None and self.rate_map.explained > _AGREES
+        if self.rate_map is None or self.rate_map.explained <= _MAY_AGREE:
+            return False
+        fits = self.hand_eye is not None and self.hand_eye.error_px < _FITS_PX
+        return fits or self.rate_map.explained > _AGREES
 
     def is_better_than_held(self, held: slice) -> bool:
         """Tell whether the points fit clearly worse where some unknowns are those of the calibration.
@@ -87,7 +93,7 @@ def analyse_camera(signals: Signals, row: int) -> CameraTurns:
     if device.imu is not None and device.imu.intrinsics is not None:
         raw = raw @ np.linalg.inv(device.imu.intrinsics.T_g).T
     rate_map = fit_rates(turns, rays, GyroTurns(signals.imu.times_ns, raw), R_I_C)
-    if rate_map is None or rate_map.explained <= _AGREES:
+    if rate_map is None or rate_map.explained <= _MAY_AGREE:
         return dataclasses.replace(nothing, rate_map=rate_map)
     S = rate_map.scatter
     size = np.sqrt(np.trace(rate_map.A @ S @ rate_map.A.T) / max(np.trace(S), 1e-12))

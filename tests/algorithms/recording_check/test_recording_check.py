@@ -296,6 +296,30 @@ def test_nothing_is_wrong_with_a_sound_mission():
     assert len({finding.check for finding in checked.findings}) == len(checked.findings)
 
 
+@pytest.mark.parametrize(
+    ("explained", "error_px", "agrees"),
+    [
+        (0.9, 0.1, True),
+        (0.45, 0.07, True),
+        (0.45, 0.9, False),
+        (0.6, 0.9, True),
+        (0.25, 0.1, False),
+    ],
+)
+def test_a_gyroscope_agrees_by_its_rates_or_by_the_points(
+    explained: float, error_px: float, agrees: bool
+):
+    (camera, *_) = doctor.diagnose(mission()).cameras
+    assert camera.rate_map is not None
+    assert camera.hand_eye is not None
+    changed = dataclasses.replace(
+        camera,
+        rate_map=dataclasses.replace(camera.rate_map, explained=explained),
+        hand_eye=dataclasses.replace(camera.hand_eye, error_px=error_px),
+    )
+    assert changed.agrees is agrees
+
+
 def test_a_corrected_calibration_passes_the_check():
     wrong = faults.with_rig(faults.with_clock(mission(), 0.02), turn_deg=(0.0, 8.0, 0.0))
     diagnosis = doctor.diagnose(wrong)
