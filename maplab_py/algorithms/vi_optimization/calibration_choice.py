@@ -17,6 +17,7 @@ from maplab_py.algorithms.vi_optimization.reports import CalibratedParameter, VI
 from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.estimation.linear import protocol, threads
 from maplab_py.estimation.terms.cameras import EXTRINSICS, INTRINSICS, TIMING
+from maplab_py.memory import NotEnoughMemory
 from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors.camera import MIRROR_NAMES
 from maplab_py.vimap import VIMap
@@ -25,6 +26,8 @@ _LANDMARK_DAMPING = 1e-12
 _CONVERGED = ("cost has converged", "no more decrease is expected", "step is small")
 _MIN_OBSERVATIONS = 3000
 _DIRECT = "multifrontal"
+_FEW_VERTICES = 2000
+"""Matrices of so many are factorised within seconds, even where every vertex sees what all others see."""
 _STRONG_GAIN, _STRONG_SHARE = 3.0, 0.5
 """No true calibration gains so many times the least: it is freed from this share of the least change on."""
 
@@ -79,12 +82,15 @@ def may_free(options: VIOptimizationOptions, report: VIOptimizationReport) -> bo
 
 def may_free_more(report: VIOptimizationReport) -> bool:
     """Tell whether more calibration may be freed after an optimisation."""
-    return is_direct(report) and report.termination in _CONVERGED
+    return can_factorise(report) and report.termination in _CONVERGED
 
 
-def is_direct(report: VIOptimizationReport) -> bool:
-    """Tell whether the linear solver was the one that supports cameras as states."""
-    return report.linear_solver == _DIRECT
+def can_factorise(report: VIOptimizationReport) -> bool:
+    """Tell whether the linear solver was the one that supports cameras as states, or can be used as well.
+
+    Conjugate gradients are chosen where they are faster, in a short flight with two cameras, too.
+    """
+    return report.linear_solver == _DIRECT or report.vertices <= _FEW_VERTICES
 
 
 def with_contradicted_freed(
@@ -103,7 +109,10 @@ def with_contradicted_freed(
     """
     flags: dict[str, Any] = {group.flag: False for group in _GROUPS}
     free = dataclasses.replace(options, **flags, linear_solver_type=_DIRECT)
-    problem = build(vi_map, free, missions=missions, progress=progress)
+    try:
+        problem = build(vi_map, free, missions=missions, progress=progress)
+    except NotEnoughMemory:
+        return options
     visual = problem.problem.visual
     if visual is None or np.count_nonzero(visual.observations.inverse_sigma) < _MIN_OBSERVATIONS:
         return options

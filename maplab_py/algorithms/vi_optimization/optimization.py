@@ -73,7 +73,7 @@ def contradicted_calibration(vi_map: VIMap, progress: Progress = SILENT) -> bool
     options = VIOptimizationOptions(calibration="auto", num_iterations=_FEW_ITERATIONS)
     quiet = _Quiet(progress)
     result, report = _optimize(vi_map, options, None, quiet, None)
-    if not calibration_choice.is_direct(report):
+    if not calibration_choice.can_factorise(report):
         return False
     return calibration_choice.with_contradicted_freed(result, options, progress=quiet) != options
 
