@@ -1,6 +1,6 @@
 """Many sessions round one loop of 200 m: what a factor takes, in time and in memory.
 
-`python -m benchmarks.loop_sessions SESSIONS KEYFRAMES [--iterations N] [--forcing X | --submaps N]`
+`python -m benchmarks.loop_sessions SESSIONS KEYFRAMES [--iterations N] [--forcing X]`
 `[--max_memory_gb GB]`
 
 Keyframes are 0.75 m apart and look outwards at a wall; every landmark has been merged over all
@@ -19,7 +19,6 @@ from maplab_py.estimation.linear.supernodal_solver import SupernodalCholesky
 from maplab_py.estimation.problem import gauge, iterative
 from maplab_py.estimation.problem.problem import Problem
 from maplab_py.estimation.problem.solver import SolverOptions, optimize_states
-from maplab_py.estimation.problem.submaps import SubmapProblem
 from maplab_py.memory import memory_limited
 from maplab_py.progress import SILENT
 
@@ -94,24 +93,21 @@ def main() -> None:
     parser.add_argument("keyframes", type=int)
     parser.add_argument("--iterations", type=int, default=3)
     parser.add_argument("--forcing", type=float, default=0.0, help="of pcg; 0 = direct")
-    parser.add_argument("--submaps", type=int, default=0, help="solved one by one; 0 = jointly")
     parser.add_argument("--max_memory_gb", type=float, default=0.0, help="for a factor; 0 = all")
     arguments = parser.parse_args()
-    _solve(make_loop(2, 20), arguments.forcing, arguments.submaps, 1)  # loads compiled kernels
+    _solve(make_loop(2, 20), arguments.forcing, 1)  # loads compiled kernels
     problem = make_loop(arguments.sessions, arguments.keyframes)
     print(f"{len(problem.visual.T_G_I)} keyframes, {len(problem.visual.keyframe)} observations")
     with memory_limited(arguments.max_memory_gb):
-        print(_solve(problem, arguments.forcing, arguments.submaps, arguments.iterations))
+        print(_solve(problem, arguments.forcing, arguments.iterations))
 
 
-def _solve(made: problems.InertialProblem, forcing: float, submaps: int, iterations: int) -> str:
+def _solve(made: problems.InertialProblem, forcing: float, iterations: int) -> str:
     """Optimise and say what it took."""
     states, visual, factors = inertial_parts(made)
     with effort() as spent:
-        if submaps:
-            problem: Problem = SubmapProblem(states, visual, factors, submaps, tell=print)
-        elif forcing:
-            problem = iterative.IterativeProblem(
+        if forcing:
+            problem: Problem = iterative.IterativeProblem(
                 states, visual, factors, None, iterative.IterativeOptions(forcing=forcing)
             )
         else:

@@ -7,13 +7,11 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from maplab_py.algorithms.vi_optimization.options import SolverFlags
-from maplab_py.errors import FlagError
 from maplab_py.estimation.linear.ordering import OrderingKind
 from maplab_py.estimation.linear.pattern import BlockPattern
 from maplab_py.estimation.linear.symbolic import analyse
 from maplab_py.estimation.problem.iterative import IterativeOptions, IterativeProblem
 from maplab_py.estimation.problem.problem import Problem
-from maplab_py.estimation.problem.submaps import SubmapProblem
 from maplab_py.estimation.states import States
 from maplab_py.estimation.terms.protocol import FactorTerm
 from maplab_py.estimation.terms.visual import VisualTerms
@@ -36,13 +34,8 @@ def make_problem(
     """Return the problem with the linear solver of the options; `auto` decides by predicted costs.
 
     Raises:
-        FlagError: A number is out of range, or flags contradict each other.
         NotEnoughMemory: The solver does not fit.
     """
-    if options.submaps and options.linear_solver_type == "pcg":
-        raise FlagError(
-            "--ba_submaps factorises: drop --ba_linear_solver_type=pcg, or --ba_submaps"
-        )
 
     def direct() -> Problem:
         with _limited(options):
@@ -52,18 +45,7 @@ def make_problem(
         settings = IterativeOptions(forcing=options.pcg_forcing, budget=budget)
         return IterativeProblem(states, visual, terms, direct, settings, progress.line)
 
-    def in_submaps() -> Problem:
-        with _limited(options):
-            return SubmapProblem(
-                states, visual, terms, options.submaps, OrderingKind(options.ordering), direct,
-                progress.line,
-            )  # fmt: skip
-
     obstacle = _obstacle(visual)
-    if options.submaps and not obstacle:
-        return _with_remedy(in_submaps, remedy=", or take less by a larger --ba_submaps")
-    if options.submaps:
-        progress.line(f"linear solver: direct, since submaps do not support {obstacle}")
     if options.linear_solver_type == "pcg":
         if not obstacle:
             return iterative()

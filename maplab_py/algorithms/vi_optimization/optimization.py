@@ -202,7 +202,7 @@ class _Quiet(SilentProgress):
 def solver_options(options: SolverFlags) -> SolverOptions:
     """Return the solver options of the flags."""
     return SolverOptions(
-        num_iterations=(options.submaps and options.submap_rounds) or options.num_iterations,
+        num_iterations=options.num_iterations,
         max_time_seconds=options.max_time_seconds,
         initial_radius=options.initial_trust_region_radius,
         max_radius=options.max_trust_region_radius,

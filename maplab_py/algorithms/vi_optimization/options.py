@@ -165,13 +165,6 @@ class SolverFlags(Options):
     ordering: str = option("auto", choices=("auto", "minimum_degree", "nested_dissection"))
     """Elimination order of the linear solver: minimum degree, nested dissection (for trajectories that
     overlap), or whichever of them takes less work"""
-    submaps: int = option(0, ge=0)
-    """Number of submaps into which the problem is cut where few states connect them; keep the equations of
-    one submap at a time in memory, the others in the temporary folder (TMPDIR); the steps are those of the
-    direct solver; 0 = all in memory."""
-    submap_rounds: int = option(0, ge=0)
-    """Largest number of rounds over all submaps with --ba_submaps, each of which is an iteration of the joint
-    problem; 0 = --ba_num_iterations."""
     use_nonmonotonic_steps: bool = False
     """Accept steps that increase the cost temporarily"""
     max_consecutive_nonmonotonic_steps: int = 5

@@ -118,13 +118,7 @@ def add_to_diagonal(layout: BlockLayout, places: I32, added: F64, numbers: F64) 
 
 @compiled()
 def project_panels(
-    plan: FrontPlan,
-    is_restricted: Mask,
-    projector: F64,
-    size: F64,
-    numbers: F64,
-    first_panel: int,
-    end_panel: int,
+    plan: FrontPlan, is_restricted: Mask, projector: F64, size: F64, numbers: F64
 ) -> None:
     """Turn the stored matrix A into P A P + s (I - P), in place.
 
@@ -134,13 +128,11 @@ def project_panels(
         projector: Symmetric projectors (n, d, d).
         size: Pivots s (n,) of the directions that are projected away.
         numbers: Panels.
-        first_panel: First supernode whose panel is meant.
-        end_panel: Supernode after the last.
     """
     d = plan.node_size
     room = np.empty(len(plan.order), np.int64)
     work = np.empty((2, d, d))
-    for s in range(first_panel, end_panel):
+    for s in range(len(plan.parent)):
         first, end = plan.first_node[s], plan.first_node[s + 1]
         width, below = end - first, plan.below_start[s + 1] - plan.below_start[s]
         panel = numbers[plan.panel_start[s] : plan.panel_start[s + 1]].reshape(width * d, -1)

@@ -10,7 +10,7 @@ import numpy as np
 
 from maplab_py.array_types import F64
 from maplab_py.compilation import compiled
-from maplab_py.estimation.linear.symbolic import FrontPlan
+from maplab_py.estimation.linear.symbolic import FrontPlan, most_below
 
 
 @compiled(fastmath={"reassoc", "contract"})
@@ -36,41 +36,16 @@ def solve_single(plan: FrontPlan, factor: F64, right_side: F64) -> F64:
         for r in range(d):
             x[place * d + r] = right_side[order[place] * d + r]
     supernodes = len(plan.first_node) - 1
-    solve_forwards(plan, factor, x, 0, supernodes)
-    solve_backwards(plan, factor, x, 0, supernodes)
+    gathered = np.empty(most_below(plan) * d)
+    for s in range(supernodes):
+        _up(plan, s, factor, x, gathered)
+    for s in range(supernodes - 1, -1, -1):
+        _down(plan, s, factor, x, gathered)
     result = np.empty(len(x))
     for place in range(len(order)):
         for r in range(d):
             result[order[place] * d + r] = x[place * d + r]
     return result
-
-
-@compiled()
-def solve_forwards(plan: FrontPlan, factor: F64, x: F64, first: int, end: int) -> None:
-    """Solve L y = b in place, rows (n * d,) in elimination order, with the supernodes from `first` to `end`.
-
-    The rows of their ancestors lose what is eliminated.
-    """
-    gathered = np.empty(_tallest(plan, first, end) * plan.node_size)
-    for s in range(first, end):
-        _up(plan, s, factor, x, gathered)
-
-
-@compiled()
-def solve_backwards(plan: FrontPlan, factor: F64, x: F64, first: int, end: int) -> None:
-    """Solve L^T x = y in place in the rows of the supernodes from `first` to `end`, ancestors first."""
-    gathered = np.empty(_tallest(plan, first, end) * plan.node_size)
-    for s in range(end - 1, first - 1, -1):
-        _down(plan, s, factor, x, gathered)
-
-
-@compiled()
-def _tallest(plan: FrontPlan, first: int, end: int) -> int:
-    """Return the largest number of nodes below one of the supernodes from `first` to `end`."""
-    tallest = 0
-    for s in range(first, end):
-        tallest = max(tallest, plan.below_start[s + 1] - plan.below_start[s])
-    return tallest
 
 
 @compiled(forceinline=True)

@@ -44,24 +44,21 @@ SCRATCH_SIZE = 2**18
 
 
 @compiled()
-def factorise(plan: FrontPlan, numbers: F64, scratch: F64, blas: Blas, first: int, end: int) -> int:
+def factorise(plan: FrontPlan, numbers: F64, scratch: F64, blas: Blas) -> int:
     """Overwrite the panels of A by those of L; return -1 or the position that has no pivot.
 
-    Supernodes from `first` up to `end` are eliminated; what they leave is subtracted from the panels of
-    all their ancestors.
+    What a supernode leaves is subtracted from the panels of all its ancestors.
 
     Args:
         plan: Structure.
         numbers: Panels.
         scratch: Room for a part of an update matrix; at least as large as a panel is wide, squared.
         blas: Workspace.
-        first: First supernode.
-        end: Supernode after the last.
     """
     d = plan.node_size
     room = most_below(plan) + 1
     local, runs = np.empty(room, np.int64), np.empty((room, 2), np.int64)
-    for s in range(first, end):
+    for s in range(len(plan.parent)):
         w = (plan.first_node[s + 1] - plan.first_node[s]) * d
         n = (plan.below_start[s + 1] - plan.below_start[s]) * d
         panel = numbers[plan.panel_start[s] : plan.panel_start[s + 1]]

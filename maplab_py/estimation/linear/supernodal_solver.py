@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Protocol
 
 import numpy as np
 
@@ -265,8 +264,7 @@ class SupernodalCholesky:
 
     def project(self, is_restricted: Mask, projector: F64, size: F64) -> None:
         """Turn the matrix A into P A P + s (I - P); see `block_storage.project_panels`."""
-        every = 0, len(self.plan.parent)
-        project_panels(self.plan, is_restricted, projector, size, self.numbers, *every)
+        project_panels(self.plan, is_restricted, projector, size, self.numbers)
 
     def blocks(self, rows: I32, cols: I32) -> F64:
         """Return blocks (B, d, d) of the matrix as it was summed."""
@@ -281,8 +279,7 @@ class SupernodalCholesky:
             NotPositiveDefinite: A pivot is not positive (or not a number).
         """
         with single_blas_thread():
-            every = 0, len(self.plan.parent)
-            bad = supernodal.factorise(self.plan, self.numbers, self._scratch, self._blas, *every)
+            bad = supernodal.factorise(self.plan, self.numbers, self._scratch, self._blas)
         if bad >= 0:
             raise NotPositiveDefinite(int(self.plan.order[bad]))
         self._is_factorised = True
@@ -310,16 +307,6 @@ class SupernodalCholesky:
             raise ValueError("the matrix has to be factorised before its factor can be used")
 
 
-class BlockSums(Protocol):
-    """Storage in which the blocks of a matrix are summed."""
-
-    layout: BlockLayout
-    numbers: F64  # the storage; see `block_storage`
-
-    def add(self, rows: I32, cols: I32, places: I32, values: F64) -> None:
-        """Add blocks (B, d, d) at block rows and columns (B,); of diagonal ones the lower triangle."""
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class BlockPlaces:
     """Blocks (B,) of a pattern, and where they lie in a solver's storage."""
@@ -334,7 +321,7 @@ class BlockPlaces:
         short_rows, short_cols = rows.astype(np.int32), cols.astype(np.int32)
         return cls(short_rows, short_cols, solver.places(short_rows, short_cols))
 
-    def add(self, solver: BlockSums, values: F64, first: int = 0) -> None:
+    def add(self, solver: SupernodalCholesky, values: F64, first: int = 0) -> None:
         """Add the blocks (k, d, d) from number `first` on to a matrix."""
         part = slice(first, first + len(values))
         solver.add(self.rows[part], self.cols[part], self.places[part], values)

@@ -13,7 +13,7 @@ from maplab_py.estimation.codegen.kernels import camera_columns, visual_kernels
 from maplab_py.estimation.kernels import visual_arguments
 from maplab_py.estimation.kernels.loss import loss_and_weight
 from maplab_py.estimation.kernels.schur_products import KeptSystem, PoseSums
-from maplab_py.estimation.linear.supernodal_solver import BlockPlaces, BlockSums, SupernodalCholesky
+from maplab_py.estimation.linear.supernodal_solver import BlockPlaces, SupernodalCholesky
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.states import NODES_PER_VERTEX, States
 from maplab_py.estimation.terms import visual_structure
@@ -28,7 +28,6 @@ from maplab_py.estimation.terms.cameras import (
     pixel_delay_s,
 )
 from maplab_py.geometry import se3
-from maplab_py.vimap.table import starts_of_counts
 
 _BLOCKS_AT_ONCE = 65_536
 _LEAST_DAMPING = 1e-12
@@ -143,42 +142,6 @@ class VisualTerms:
         """Give back the memory of the plan, which is made again when somebody needs it."""
         self.__dict__.pop("plan", None)
 
-    def part(
-        self,
-        landmarks: I64,
-        rows: I64,
-        vertex: I32,
-        num_vertices: int,
-        plan: visual_structure.EliminationPlan | None,
-    ) -> VisualTerms:
-        """Return the terms of some landmarks over the vertices that see them, numbered anew.
-
-        Cameras must not be estimated.
-
-        Args:
-            landmarks: Rows (l,) of the landmarks.
-            rows: Their observations (o,), by landmark.
-            vertex: New number (o,) of the vertex of each.
-            num_vertices: Number of vertices that see them.
-            plan: Plan of these terms if it is known already.
-        """
-        data = self.observations
-        chosen = Observations(
-            starts_of_counts(np.diff(data.start)[landmarks]),
-            vertex,
-            data.camera[rows],
-            data.uv_px[rows],
-            data.inverse_sigma[rows],
-            data.loss_scale[rows],
-        )
-        terms = VisualTerms(
-            self._kernels, chosen, self._cameras, num_vertices, loss=self.loss,
-            move_points=self.moves_points, landmark_prior=self._prior[landmarks],
-        )  # fmt: skip
-        if plan is not None:
-            terms.__dict__["plan"] = plan  # computed before
-        return terms
-
     @cached_property
     def _Y(self) -> F64:
         return np.empty((self.plan.largest_slab, 3, 6))
@@ -259,7 +222,7 @@ class VisualTerms:
         return VisualPlaces(target, border)
 
     def linearize(
-        self, states: States, damping: float, solver: BlockSums, places: VisualPlaces
+        self, states: States, damping: float, solver: SupernodalCholesky, places: VisualPlaces
     ) -> NodeSystem:
         """Eliminate the landmarks; add what is left to the solver's matrix and the result."""
         cost = np.zeros(self.num_chunks)

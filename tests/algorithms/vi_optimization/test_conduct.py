@@ -336,37 +336,3 @@ def test_whatever_is_estimated_the_optimum_is_that_of_the_direct_solver(
         )  # fmt: skip
         costs.append(optimize(near, options)[1].cost_after)
     assert costs[1] == pytest.approx(costs[0], rel=1e-8)
-
-
-def test_submaps_on_request_give_the_same_map() -> None:
-    common = {"num_iterations": 8, "function_tolerance": 0.0}
-    reports = {}
-    for submaps in (0, 4):
-        options = VIOptimizationOptions(submaps=submaps, **common)  # type: ignore[arg-type]
-        reports[submaps] = optimize(sessions(), options)[1]
-    assert "submaps" in reports[4].linear_solver
-    assert reports[4].cost_after == pytest.approx(reports[0].cost_after, rel=1e-9)
-    options = VIOptimizationOptions(submaps=4, submap_rounds=2, **common)  # type: ignore[arg-type]
-    assert optimize(sessions(), options)[1].iterations == 2
-
-
-def test_submaps_say_what_is_in_memory_and_refuse_other_solvers() -> None:
-    progress = Lines()
-    build(sessions(), VIOptimizationOptions(submaps=4), progress=progress)
-    (line,) = progress.lines
-    assert "submaps" in line
-    assert "GB in memory, the rest in" in line
-    for flags, said in (
-        ({"submaps": 4, "linear_solver_type": "pcg"}, "drop --ba_linear_solver_type=pcg"),
-        ({"submaps": -1}, "--ba_submaps=-1: must be at least 0"),
-        ({"submap_rounds": -1}, "--ba_submap_rounds=-1: must be at least 0"),
-    ):
-        with pytest.raises(FlagError, match=said):
-            build(sessions(), VIOptimizationOptions(**flags))  # type: ignore[arg-type]
-
-
-def test_cameras_that_are_estimated_stay_direct() -> None:
-    progress = Lines()
-    options = VIOptimizationOptions(submaps=4, fix_ncamera_intrinsics=False)
-    build(sessions(), options, progress=progress)
-    assert progress.lines[0].startswith("linear solver: direct, since submaps do not support")
