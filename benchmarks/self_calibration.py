@@ -17,13 +17,13 @@ from pathlib import Path
 
 from maplab_py.algorithms.self_calibration.calibration import calibrate
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
+from maplab_py.algorithms.self_calibration.segments.information_gain import select_by_gain
 from maplab_py.algorithms.self_calibration.segments.selection import collect
-from maplab_py.research.information_gain import select_by_gain
-from maplab_py.research.joint_ekf import filter_jointly
 from maplab_py.simulation.scenario import MotionOptions, SessionOptions
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate
 from maplab_py.vimap import VIMap
+from studies.joint_ekf import filter_jointly
 
 OPTIONS = SelfCalibrationOptions(keep_unobservable_at_prior=True)
 _ROUND_S = 60.0

@@ -8,11 +8,13 @@ python -m studies page --results=ar_room.jsonl --consistency=swaps.jsonl --docs=
 python -m studies picture --out=docs/images/segment_information.svg
 python -m studies figures --sets=3 --out=docs/images/self_calibration_figures.svg
 python -m studies borders --sets=4 --out=borders.jsonl
+python -m studies joint_ekf --map=FOLDER --out=FOLDER
 
 The first four studies append one line per data set and method to a file; a study that was interrupted
 continues. All data sets are recorded with the same device in the same room; motion, noise and appearance
 differ. `page` writes self_calibration_results.md and images/ into a folder; `picture` draws a session,
-coloured by information, `figures` counterparts of those of the thesis.
+coloured by information, `figures` counterparts of those of the thesis. `joint_ekf` calibrates the device
+of a map by a Kalman filter of motion and calibration, and saves the map with the result.
 """
 
 import argparse
@@ -28,9 +30,12 @@ from maplab_py.output_files import write_text
 from maplab_py.simulation.scenario import Scenario
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.simulation.simulate import simulate
+from maplab_py.storage.map_saving import save_map
+from maplab_py.storage.native import load_map
 from studies import (
     accuracy,
     figures,
+    joint_ekf,
     odometry,
     predicted_deviations,
     results_page,
@@ -53,6 +58,9 @@ def main(words: Sequence[str] | None = None) -> int:
             for names in (given.results, given.consistency)
         )
         results_page.write_page(results, consistency, given.notes, given.docs)
+        return 0
+    if given.study == "joint_ekf":
+        _calibrate_by_filter(given.map, given.out)
         return 0
     scenario = load_scenario(given.scenario)
     if given.study == "picture":
@@ -87,6 +95,13 @@ def _picture(scenario: Scenario) -> str:
     report, segments = segment_information(vi_map, SelfCalibrationOptions())
     scores = [segment.imu for segment in report.segments]
     return draw(vi_map, segments, scores, f"information about the IMU, scenario {scenario.name}")
+
+
+def _calibrate_by_filter(map_folder: Path, out: Path) -> None:
+    vi_map, _ = load_map(map_folder)
+    filtered = joint_ekf.filter_jointly(vi_map, SelfCalibrationOptions())
+    sys.stdout.write(f"{filtered.report().as_json()}\n")
+    save_map(vi_map.replace(sensors=filtered.sensors), out)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -128,6 +143,9 @@ def _parser() -> argparse.ArgumentParser:
         if name == "odometry":
             study.add_argument("--results", type=Path, required=True)
             study.add_argument("--methods", default=",".join(JUDGED))
+    baseline = studies.add_parser("joint_ekf")
+    baseline.add_argument("--map", type=Path, required=True)
+    baseline.add_argument("--out", type=Path, required=True)
     page = studies.add_parser("page")
     page.add_argument("--results", default="", help="files, separated by commas")
     page.add_argument("--consistency", default="", help="files, separated by commas")

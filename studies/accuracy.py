@@ -12,12 +12,12 @@ from maplab_py.algorithms.self_calibration.calibration import Calibration, calib
 from maplab_py.algorithms.self_calibration.device import transfer_calibration
 from maplab_py.algorithms.self_calibration.reports import SelfCalibrationReport
 from maplab_py.algorithms.self_calibration.segments import selection, splitting
+from maplab_py.algorithms.self_calibration.segments.information_gain import select_by_gain
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.array_types import F64
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.blocks import ParameterBlocks
-from maplab_py.research.information_gain import select_by_gain
 from maplab_py.sensors import SensorSet
 from maplab_py.simulation.evaluation import evaluate_map
 from maplab_py.simulation.scenario import Scenario

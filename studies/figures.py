@@ -13,12 +13,12 @@ from maplab_py.algorithms.self_calibration.segments import selection, splitting
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import so3
-from maplab_py.research.joint_ekf import filter_jointly
 from maplab_py.simulation.scenario import Scenario
 from maplab_py.simulation.scenario_file import load_scenario
 from maplab_py.vimap import VIMap
 from studies.accuracy import DataSet
 from studies.data_sets import OPTIONS, data_set
+from studies.joint_ekf import filter_jointly
 from studies.results_page import levels, relative_rms
 from studies.selections import FEW, WHOLE, rankings
 

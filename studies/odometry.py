@@ -15,7 +15,6 @@ from maplab_py.algorithms.self_calibration.estimation.problem import SegmentProb
 from maplab_py.algorithms.vi_optimization.solution import with_estimated_sensors
 from maplab_py.array_types import F64
 from maplab_py.geometry import alignment, se3
-from maplab_py.research.joint_ekf import filter_jointly
 from maplab_py.sensors import SensorSet
 from maplab_py.simulation.scenario import Scenario
 from maplab_py.simulation.simulate import SimulatedData
@@ -28,6 +27,7 @@ from studies.data_sets import (
     problem_of,
     true_problem,
 )
+from studies.joint_ekf import filter_jointly
 
 _FIXED = dataclasses.replace(OPTIONS, states="extrinsics_rotation", prior_rotation_deg=1e-6)
 """Prior of the rotation that the filter estimates: a millionth of a degree, effectively fixed."""

@@ -55,7 +55,6 @@ def self_calibrate(
     options: SelfCalibrationOptions = SelfCalibrationOptions(),
     database: Path | None = None,
     batch: bool = False,
-    joint_ekf: bool = False,
     max_camera_shift_m: float = 0.025,
     parts: int = 0,
     chosen: MissionChoice = ALL_MISSIONS,
@@ -66,37 +65,21 @@ def self_calibrate(
     Args:
         database: Segment database: its segments are used too, and the map's are added to it.
         batch: Use all data of the missions instead of segments.
-        joint_ekf: For comparison: estimate IMU and camera poses on the IMU by a Kalman filter along
-            the missions; camera intrinsics are fixed.
         max_camera_shift_m: If the data would move a camera on the IMU farther than this, keep its
             position and calibrate the rest again; 0 = no limit.
         parts: Calibrate on so many parts of the data too; reported deviations are then at least the
             spread of the results, which contains errors of the models. 0 = none.
     """
     missions = chosen.rows(context.vi_map)
-    if (batch or joint_ekf) and database is not None:
-        raise UserError(
-            "--database needs segments: it cannot be combined with --batch or --joint_ekf"
-        )
-    if batch and joint_ekf:
-        raise UserError("--batch and --joint_ekf cannot be combined")
+    if batch and database is not None:
+        raise UserError("--database needs segments: it cannot be combined with --batch")
     if not max_camera_shift_m >= 0.0:
         raise UserError(f"--max_camera_shift_m={max_camera_shift_m:g}: must be 0 or more")
-    if joint_ekf:
-        from maplab_py.research.joint_ekf import filter_jointly
-
-        filtered = filter_jointly(
-            context.vi_map, options, missions=missions, progress=context.progress
-        )
-        context.commit(context.vi_map.replace(sensors=filtered.sensors))
-        return filtered.report()
-
     from maplab_py.algorithms.self_calibration.checks import calibrate_with_checks
     from maplab_py.algorithms.self_calibration.segments.database import (
         locked_database,
         save_database,
     )
-    from maplab_py.research.information_gain import select_by_gain
 
     with locked_database(None if context.is_trial else database):
         sensors, collected, report = calibrate_with_checks(
@@ -107,7 +90,6 @@ def self_calibrate(
             database=_existing(database, size),
             missions=missions,
             batch=batch,
-            selector=select_by_gain if options.selection == "information_gain" else None,
             progress=context.progress,
         )
         context.progress.check()

@@ -97,17 +97,6 @@ def test_batch_uses_everything(session: Session) -> None:
     assert abs(focal_px(session) - 310.0) <= 1.0
 
 
-def test_the_joint_filter_leaves_the_lens_alone(session: Session) -> None:
-    before = device(session.vi_map)[1]
-    report = session.run("self_calibrate", joint_ekf=True, dry_run=True, **FLAGS)
-    assert device(session.vi_map)[1] is before
-    assert not [one for one in report.parameters if "focal" in one.parameter]
-    session.run("self_calibrate", joint_ekf=True, **FLAGS)
-    after = device(session.vi_map)[1]
-    np.testing.assert_array_equal(after.cameras[0].intrinsics, before.cameras[0].intrinsics)
-    assert np.abs(after.T_B_C - before.T_B_C).max() > 1e-5
-
-
 def test_collect_show_prune_and_export(session: Session, tmp_path: Path) -> None:
     database = tmp_path / "device.segments"
     planned = session.run("collect_segments", database=database, dry_run=True, **FLAGS)
@@ -176,8 +165,6 @@ def test_mistakes_are_explained(session: Session, tmp_path: Path) -> None:
         session.run("self_calibrate", sc_groups="imu,lens")
     with pytest.raises(UserError, match="cannot be combined with --batch"):
         session.run("self_calibrate", batch=True, database=tmp_path / "d")
-    with pytest.raises(UserError, match="cannot be combined"):
-        session.run("self_calibrate", batch=True, joint_ekf=True)
     with pytest.raises(UserError, match="max_camera_shift_m"):
         session.run("self_calibrate", max_camera_shift_m=-1.0)
     with pytest.raises(UserError, match="sc_segments_per_group"):

@@ -6,7 +6,6 @@ Hence the camera's position is limited, and results on parts of the data are com
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +16,10 @@ from maplab_py.algorithms.self_calibration.device import device_of
 from maplab_py.algorithms.self_calibration.estimation.problem import SegmentProblem, runs_of
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
 from maplab_py.algorithms.self_calibration.segments.database import SegmentDatabase
+from maplab_py.algorithms.self_calibration.segments.information_gain import select_by_gain
 from maplab_py.algorithms.self_calibration.segments.selection import collect
 from maplab_py.algorithms.self_calibration.segments.splitting import extract_submap
 from maplab_py.algorithms.self_calibration.uncertainty import Verdict
-from maplab_py.array_types import I64
 from maplab_py.errors import UserError
 from maplab_py.estimation.terms.cameras import EXTRINSICS
 from maplab_py.progress import SILENT, Progress
@@ -32,11 +31,6 @@ _POSITION = "extrinsics_translation"
 _MAX_CHANGE_IN_SIGMAS = 3.0
 _MIN_SPAN_S = 30.0
 """Shorter data may share one error of the models: they confirm no larger change by themselves."""
-
-Selector = Callable[
-    [VIMap, SelfCalibrationOptions, NDArray[np.integer] | None, Progress], Sequence[I64]
-]
-"""Select segments (vertex rows) of some missions (rows, None = all) of a map."""
 
 
 def camera_shift_m(result: Calibration) -> float:
@@ -57,7 +51,6 @@ def calibrate_with_checks(
     database: SegmentDatabase | None = None,
     missions: NDArray[np.integer] | None = None,
     batch: bool = False,
-    selector: Selector | None = None,
     progress: Progress = SILENT,
 ) -> tuple[SensorSet, SegmentDatabase | None, reports.SelfCalibrationReport]:
     """Calibrate; where a camera moves too far, keep its position and calibrate the rest again.
@@ -69,7 +62,6 @@ def calibrate_with_checks(
         database: Segments of earlier sessions.
         missions: Missions (rows, None = all).
         batch: Use all data instead of segments.
-        selector: Another way to select segments; then there is no database.
 
     Raises:
         EstimationError: The data do not determine the calibration.
@@ -78,9 +70,7 @@ def calibrate_with_checks(
     if parts == 1 or parts < 0:
         raise UserError("a spread needs two parts of the data at least")
     device, collected = device_of(vi_map, missions), None
-    if not batch and selector is None:
-        if options.selection == "information_gain":
-            raise UserError("selection by information gain needs its selector (maplab_py.research)")
+    if not batch and options.selection != "information_gain":
         collected, _ = collect(vi_map, options, database, missions=missions, progress=progress)
 
     def estimate(
@@ -92,8 +82,7 @@ def calibrate_with_checks(
         if collected is not None:
             segments, count = collected.vi_map, len(collected)
         else:
-            assert selector is not None
-            rows = selector(vi_map, options, missions, progress)
+            rows = select_by_gain(vi_map, options, missions, progress)
             segments, count = extract_submap(vi_map, np.unique(np.concatenate(rows))), len(rows)
         result, report = calibrate(segments, options, segments=count, progress=progress)
         source = device_of(segments)

@@ -31,9 +31,9 @@ from maplab_py.estimation.terms import inertial_calibration
 from maplab_py.estimation.terms.cameras import EXTRINSICS, camera_blocks
 from maplab_py.geometry import se3, so3
 from maplab_py.progress import SILENT, Progress
-from maplab_py.research.ekf_tracks import TrackResiduals, linearised, tracks_of
 from maplab_py.sensors import SensorSet
 from maplab_py.vimap import VIMap
+from studies.ekf_tracks import TrackResiduals, linearised, tracks_of
 
 WINDOW = 20
 """Poses in the sliding window."""

@@ -1,6 +1,8 @@
 """The joint filter, a baseline: exact without noise, about as good as it says with it."""
 
 import dataclasses
+import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,10 +12,19 @@ from maplab_py.errors import EstimationError
 from maplab_py.estimation.blocks import ParameterBlocks
 from maplab_py.estimation.terms.cameras import EXTRINSICS, INTRINSICS
 from maplab_py.geometry import se3
-from maplab_py.research import ekf_tracks, joint_ekf
 from maplab_py.sensors.sensor_set import Sensor
+from maplab_py.storage.map_saving import save_map
+from maplab_py.storage.native import load_map
 from maplab_py.vimap import VIMap
-from tests.algorithms.self_calibration.scenes import OPTIONS, device, nominal, scene_map
+from studies import ekf_tracks, joint_ekf
+from studies.__main__ import main
+from tests.algorithms.self_calibration.scenes import (
+    OPTIONS,
+    device,
+    nominal,
+    scene_map,
+    uncalibrated,
+)
 
 
 def with_known_lens(truth: VIMap) -> VIMap:
@@ -117,3 +128,14 @@ def test_only_what_is_asked_for_moves() -> None:
     moved = result.blocks[EXTRINSICS].difference(result.before[EXTRINSICS].values)[0]
     assert np.abs(moved[:3]).max() <= 1e-12
     assert np.abs(moved[3:]).max() > 1e-4
+
+
+def test_a_map_of_a_folder_is_calibrated_but_for_the_lens(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_map(uncalibrated(scene_map(vertices=61, noise=1.0)), tmp_path / "walk")
+    assert main(["joint_ekf", f"--map={tmp_path / 'walk'}", f"--out={tmp_path / 'result'}"]) == 0
+    assert not [p for p in json.loads(capsys.readouterr().out)["parameters"] if "focal" in str(p)]
+    before, after = (device(load_map(tmp_path / name)[0])[1] for name in ("walk", "result"))
+    np.testing.assert_array_equal(after.cameras[0].intrinsics, before.cameras[0].intrinsics)
+    assert np.abs(after.T_B_C - before.T_B_C).max() > 1e-5
