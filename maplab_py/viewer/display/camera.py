@@ -31,12 +31,14 @@ Pages tell their size in pixels of the device, which differ; so only its form co
 """
 Window = tuple[float, float, float]
 """Width by height of a page, and the parts of both that are free."""
+View = tuple[F64, F64]
+"""Position (3,) and target (3,) of a camera."""
 _WIDE: Window = (_ASPECT, _FREE, 1.0)
 _GIVEN = 64
 """Views of late that pages were given."""
 _LEAST_FAR_M = 100.0
 """Distance up to which pages show a map that has just begun: they may be moved before it grows."""
-_LEAST_SHARE, _ROOM = 0.5, 1.25
+_LEAST_SHARE, _ROOM = 0.65, 1.1
 """Share of the picture below which a map is moved closer to; room that a map gets to grow."""
 
 
@@ -47,7 +49,7 @@ def view_of(
     beside_panel: bool = False,
     room: float = 1.0,
     window: Window = _WIDE,
-) -> tuple[F64, F64]:
+) -> View:
     """Return camera position (3,) and target (3,) that just show the whole outline; z is up.
 
     The overview and the view from the side look across the longest direction of the map.
@@ -101,7 +103,7 @@ def _across(outline: F64) -> float:
     return float(np.arctan2(normal[1], normal[0]))
 
 
-def share_of_picture(extent: Extent, position: F64, target: F64) -> float:
+def share_of_picture(extent: Extent, position: F64, target: F64, window: Window = _WIDE) -> float:
     """Return the share of the free part of a page that the outline spans; infinite if it is not all seen."""
     back = (position - target) / np.linalg.norm(position - target)
     right = np.cross([0.0, 0.0, 1.0], back)
@@ -110,8 +112,9 @@ def share_of_picture(extent: Extent, position: F64, target: F64) -> float:
     if (p[:, 2] >= 0.0).any():
         return np.inf
     tangent = np.tan(0.5 * FIELD_OF_VIEW_RAD)
-    seen = p[:, :2] / (-p[:, 2:] * tangent * np.array([_ASPECT, 1.0]))
-    seen[:, 0] = (seen[:, 0] + 1.0 - _FREE) / _FREE
+    aspect, *free = window
+    seen = p[:, :2] / (-p[:, 2:] * tangent * np.array([aspect, 1.0]))
+    seen = (seen + (1.0 - np.array(free)) * [1.0, -1.0]) / free
     if (np.abs(seen) > 1.0).any():
         return np.inf
     return float(0.5 * np.ptp(seen, axis=0).max())
@@ -123,24 +126,32 @@ class Cameras:
     def __init__(self, server: Any) -> None:
         """Start with a server that shows nothing yet."""
         self._server = server
-        self._view = (np.array([0.0, -1.0, 1.0]), np.zeros(3))  # of new pages
-        self._given: deque[tuple[F64, F64]] = deque([self._view], _GIVEN)
+        self._view: View = (np.array([0.0, -1.0, 1.0]), np.zeros(3))  # of new pages
+        self._given: deque[View] = deque([self._view], _GIVEN)
+        self._newest: dict[int, tuple[View, Window]] = {}  # that pages were given, by their id
         self._extent: Extent | None = None
-        self._room = 1.0
         server.on_client_connect(self._open)
 
     def show_all(self, extent: Extent) -> None:
         """Let all pages, and those that will be opened, see everything."""
-        self._move(extent, list(self._server.get_clients().values()), room=1.0)
+        self._extent = extent
+        self._set_view(extent, room=1.0)
+        for client in self._server.get_clients().values():
+            self._fit(client, extent, room=1.0)
 
     def keep_in_view(self, extent: Extent) -> None:
         """Move cameras, unless the user has, when the map outgrows their picture or is small in it."""
-        if _LEAST_SHARE <= share_of_picture(extent, *self._view) <= 1.0:
-            return
-        clients = list(self._server.get_clients().values())
-        for client in clients:
+        self._extent = extent
+        if not _is_well_seen(extent, self._view, _WIDE):
+            self._set_view(extent, room=_ROOM)
+        clients = self._server.get_clients()
+        self._newest = {key: each for key, each in self._newest.items() if key in clients}
+        for key, client in clients.items():
+            if key in self._newest and _is_well_seen(extent, *self._newest[key]):
+                continue
             _set_planes(client.camera, extent)
-        self._move(extent, [client for client in clients if self._is_unmoved(client)], room=_ROOM)
+            if self._is_unmoved(client):
+                self._fit(client, extent, room=_ROOM)
 
     def aim_new_pages(self, extent: Extent) -> None:
         """Let pages that will be opened look as those do that nobody has moved."""
@@ -149,56 +160,53 @@ class Cameras:
     def _is_unmoved(self, client: Any) -> bool:
         """Tell whether a page looks from where it was put, or was put before: slow pages tell it late."""
         position = np.asarray(client.camera.position)
+        newest, _ = self._newest.get(client.client_id, (self._view, _WIDE))
         return any(
             np.linalg.norm(position - given) < 0.01 * np.linalg.norm(given - target)
-            for given, target in self._given
+            for given, target in (newest, *self._given)
         )
 
-    def _move(self, extent: Extent, clients: list[Any], room: float) -> None:
-        self._extent, self._room = extent, room
+    def _set_view(self, extent: Extent, room: float) -> None:
         self._view = view_of(extent, beside_panel=True, room=room)
         self._given.append(self._view)
         self.aim_new_pages(extent)
-        for client in clients:
-            self._fit(client)
 
     def _open(self, client: Any) -> None:
-        """Fit the map into a page that is narrower than others, and into each whose form changes."""
+        """Fit the map into a page, and again when its form changes."""
         form = [_WIDE]
 
         def fit_again(camera: Any) -> None:
             window = window_of(camera)
             if abs(window[0] - form[0][0]) > 0.01 and self._is_unmoved(client):
                 form[0] = window
-                self._fit(client)
+                if self._extent is not None:
+                    self._fit(client, self._extent, room=1.0)
 
         fit_again(client.camera)
         client.camera.on_update(fit_again)
 
-    def _fit(self, client: Any) -> None:
+    def _fit(self, client: Any, extent: Extent, room: float) -> None:
         """Let a page see everything beside its panel."""
-        if self._extent is None:
-            return
-        window, view = window_of(client.camera), self._view
-        if window is not _WIDE:
-            view = view_of(self._extent, beside_panel=True, room=self._room, window=window)
-        self._show(client, self._extent, view)
-
-    def _show(self, client: Any, extent: Extent, view: tuple[F64, F64]) -> None:
+        window = window_of(client.camera)
+        view = view_of(extent, beside_panel=True, room=room, window=window)
         with client.atomic():
             _look(client.camera, extent, view)
         self._given.append(view)
+        self._newest[client.client_id] = view, window
+
+
+def _is_well_seen(extent: Extent, view: View, window: Window) -> bool:
+    return _LEAST_SHARE <= share_of_picture(extent, *view, window) <= 1.0
 
 
 def window_of(camera: Any) -> Window:
-    """Return the form of a page; all that are wide enough have the same."""
+    """Return the form of a page."""
     aspect = float(camera.aspect)
     if not aspect > 0.0:
         return _WIDE  # a page that is folded away tells no form
     if aspect <= _PHONE:
         return aspect, 1.0, _FREE_HEIGHT
-    free = 1.0 - _PANEL / aspect
-    return (aspect, free, 1.0) if aspect * free < _ASPECT * _FREE else _WIDE
+    return aspect, 1.0 - _PANEL / aspect, 1.0
 
 
 def aim(camera: Any, extent: Extent, view: str = "overview", *, beside_panel: bool = True) -> None:
@@ -207,7 +215,7 @@ def aim(camera: Any, extent: Extent, view: str = "overview", *, beside_panel: bo
     _look(camera, extent, view_of(extent, view, beside_panel=beside_panel, window=window))
 
 
-def _look(camera: Any, extent: Extent, view: tuple[F64, F64]) -> None:
+def _look(camera: Any, extent: Extent, view: View) -> None:
     position, target = view
     camera.up_direction = (0.0, 0.0, 1.0)
     camera.position = position
@@ -261,7 +269,7 @@ def _line_of_sight(drawing: Drawing, vertex: int) -> tuple[F64, F64]:
     return p, step / length if length > 1e-9 else np.array([1.0, 0.0, 0.0])
 
 
-def aim_initially(camera: Any, extent: Extent, view: tuple[F64, F64]) -> None:
+def aim_initially(camera: Any, extent: Extent, view: View) -> None:
     """Set what new pages begin with (its field for the up direction has another name)."""
     position, target = view
     camera.position = tuple(position.tolist())
