@@ -6,7 +6,7 @@ import os
 import shlex
 import shutil
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
@@ -36,7 +36,7 @@ from maplab_py.console.prompt.completion import complete
 from maplab_py.console.scripts.checking import LEAVE
 from maplab_py.console.scripts.runner import Runner
 from maplab_py.console.session.maps import MapEntry
-from maplab_py.console.session.paths import state_folder
+from maplab_py.console.session.paths import recent_maps, state_folder
 from maplab_py.console.session.session import Session
 from maplab_py.console.session.status import Status
 from maplab_py.console.terminal.foreground import NotedInterrupts, interrupts_noted
@@ -191,7 +191,7 @@ def run_prompt(runner: Runner, first_line: str = "") -> Status:
         if first_line:
             _run_line(runner, first_line)
         else:
-            for text in greeting(lines):
+            for text in greeting():
                 runner.terminal.note(text)
         return _read_lines(runner, prompt)
     finally:
@@ -386,37 +386,19 @@ def _append(path: Path, data: bytes) -> None:
         os.close(descriptor)
 
 
-_MAP_WORDS = ("--map_folder=", "--save_map_folder=")
-_COMMANDS = ("load", "save", "rovioli")
-_METADATA = Path("vi_map") / "vi_map_metadata"
 _MAX_MAPS = 3
 
 
-def greeting(history: Sequence[str]) -> list[str]:
-    """Return what the prompt says first.
-
-    Args:
-        history: Lines that were typed before, oldest first.
-    """
+def greeting() -> list[str]:
+    """Return what the prompt says first: the version, a hint, and the maps that were used last."""
     lines = [f"maplab-py {version('maplab-py')} · help lists tasks and commands · Tab completes"]
-    maps = list(dict.fromkeys(_maps_of(history)))[:_MAX_MAPS]
+    here = Path.cwd()
+    maps = [
+        path.relative_to(here) if path.is_relative_to(here) and path != here else path
+        for path in recent_maps()[:_MAX_MAPS]
+    ]
     if maps:
-        lines.append("recent maps: " + " · ".join(f"load {shlex.quote(path)}" for path in maps))
+        lines.append(
+            "recent maps: " + " · ".join(f"load {shlex.quote(str(path))}" for path in maps)
+        )
     return lines
-
-
-def _maps_of(history: Sequence[str]) -> Iterator[str]:
-    """Yield the map folders of loaded and saved maps that are still there, latest first."""
-    for line in reversed(history):
-        for text in reversed(line.split(";")):
-            try:
-                words = shlex.split(text)
-            except ValueError:
-                continue
-            if not words or words[0] not in _COMMANDS:
-                continue
-            for word in words[1:]:
-                named = next((word[len(f) :] for f in _MAP_WORDS if word.startswith(f)), "")
-                path = named or ("" if word.startswith("-") else word)
-                if path and (Path(path) / _METADATA).is_file():
-                    yield path

@@ -9,6 +9,7 @@ import subprocess
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
+from pathlib import Path
 
 from maplab_py.atomic import write_file
 from maplab_py.cancellation import CancelToken
@@ -18,6 +19,7 @@ from maplab_py.console.scripts import aliases, checking, costs
 from maplab_py.console.scripts.rescue import Rescue
 from maplab_py.console.session.call import Call
 from maplab_py.console.session.jobs import Job
+from maplab_py.console.session.paths import remember_maps
 from maplab_py.console.session.session import Refusal, Session
 from maplab_py.console.session.status import Status, describe, status_of
 from maplab_py.console.terminal import foreground, output
@@ -53,6 +55,7 @@ class Runner:
         self._alias_depth = 0
         self._rescue: Rescue | None = None  # of a script
         self._plan: costs.Plan | None = None
+        self._folders: set[Path] = set()  # of maps that were used in this session
         terminal.mission_names = lambda: session.mission_names
         terminal.page_of_ids = lambda: session.marks.get("viewer", "")
 
@@ -260,6 +263,7 @@ class Runner:
             status = self.report_error(words[0], error, has_effects=token.has_effects)
             self._keep_refusal(words, error.remedy if isinstance(error, MaplabError) else "")
             return status
+        self._remember_maps()
         trial = " (dry run: nothing has changed)" if call.is_trial else ""
         self.terminal.note(f"{name}: {format_seconds(seconds)}{trial}")
         if report.advice and self.terminal.is_prompt and self.session.settings.is_on("advice"):
@@ -277,6 +281,13 @@ class Runner:
             )
             return Status.CANCELLED
         return Status.OK
+
+    def _remember_maps(self) -> None:
+        """Note the folders of maps that were loaded or saved, for the greeting of the prompt."""
+        folders = {entry.folder for entry in self.session.maps if entry.folder is not None}
+        if not folders <= self._folders:
+            remember_maps(folders - self._folders)
+            self._folders |= folders
 
     def _show(self, report: Report, name: str, seconds: float, *, in_shell: bool) -> bool:
         """Show a report; return whether it was shown to its end and not cut by Ctrl-C."""

@@ -15,6 +15,7 @@ from prompt_toolkit.output import DummyOutput
 
 from maplab_py.console.prompt.loop import greeting, open_history, run_prompt
 from maplab_py.console.scripts.runner import Runner
+from maplab_py.console.session.paths import remember_maps
 from maplab_py.console.session.session import Session
 from maplab_py.console.session.status import Status
 from maplab_py.console.terminal.output import ConsoleTerminal
@@ -22,34 +23,30 @@ from tests.console.sample_plugin import make_registry
 
 
 def _map_at(folder: Path) -> None:
-    (folder / "vi_map").mkdir(parents=True)
+    (folder / "vi_map").mkdir(parents=True, exist_ok=True)
     (folder / "vi_map" / "vi_map_metadata").touch()
 
 
-def test_it_names_the_version_and_the_way_to_help() -> None:
-    (line,) = greeting([])
-    assert line.startswith("maplab-py ")
-    assert "help" in line
-
-
-def test_it_proposes_the_maps_of_the_last_lines(
+def test_it_names_the_version_the_way_to_help_and_the_maps_that_were_used_last(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     monkeypatch.chdir(tmp_path)
-    for name in ("a", "b c", "d"):
+    (line,) = greeting()
+    assert line.startswith("maplab-py ")
+    assert "help" in line
+    for name in ("d", "a", "b c", "a", "gone"):
         _map_at(Path(name))
-    lines = [
-        "load d",
-        "load gone",
-        "load --map_folder=a; optvi",
-        "save --map_folder='b c'",
-        "load a",
-    ]
-    assert greeting(lines)[1:] == ["recent maps: load a · load 'b c' · load d"]
-
-
-def test_lines_that_no_shell_reads_are_left_out() -> None:
-    assert len(greeting(["load 'a", "", "; ;", "load"])) == 1
+        remember_maps([Path(name)])
+    (tmp_path / "gone" / "vi_map" / "vi_map_metadata").unlink()
+    assert greeting()[1:] == ["recent maps: load a · load 'b c' · load d"]
+    monkeypatch.chdir(tmp_path / "a")
+    assert (
+        greeting()[1]
+        == f"recent maps: load {tmp_path}/a · load '{tmp_path}/b c' · load {tmp_path}/d"
+    )
+    (tmp_path / "state" / "maplab" / "recent_maps").write_bytes(b"\xff\n\0\n")
+    assert len(greeting()) == 1
 
 
 def test_lines_of_two_consoles_are_kept(tmp_path: Path) -> None:
