@@ -94,7 +94,9 @@ def read_folder(folder: Path) -> Parts:
         return _read_sensor_files(folder)
     chain = folder.parent / "dso" / "camchain.yaml"
     if not chain.exists():
-        raise MapError(f"{folder}: there is no calibration (cam0/sensor.yaml): {HOW_TO_CALIBRATE}")
+        raise MapError(
+            f"{folder}: there is no calibration (cam0/sensor.yaml): {HOW_TO_CALIBRATE}{_beside(folder)}"
+        )
     cameras = kalibr.read_camera_chain(read_entry(chain))
     imu_file = chain.with_name("imu_config.yaml")
     if not imu_file.exists():
@@ -102,6 +104,12 @@ def read_folder(folder: Path) -> Parts:
     if cameras.why_not_on_imu:
         raise MapError(cameras.why_not_on_imu)
     return with_imu(cameras, kalibr.read_kalibr_imu(read_entry(imu_file)))
+
+
+def _beside(folder: Path) -> str:
+    """Name the YAML files in a recording's folder and beside it, one of which may be the calibration."""
+    files = [path for place in (folder, folder.parent) for path in sorted(place.glob("*.y*ml"))]
+    return f"; perhaps one of {', '.join(map(str, files[:4]))}" if files else ""
 
 
 def _read_sensor_files(folder: Path) -> Parts:

@@ -267,6 +267,10 @@ DAMAGES = {
         lambda f: [p.unlink() for p in f.rglob("sensor.yaml")],
         "there is no calibration .*--sensor_calibration_file",
     ),
+    "a calibration beside it": (
+        lambda f: [(f / "chain.yaml").touch(), *(p.unlink() for p in f.rglob("sensor.yaml"))],
+        r"--sensor_calibration_file.*perhaps one of .*chain\.yaml",
+    ),
     "no camera model": (
         lambda f: _edit(f / "mav0/cam0/sensor.yaml", "pinhole", "ocam"),
         r"cam0/sensor\.yaml: key 'camera_model': 'ocam' is not supported",
