@@ -104,6 +104,30 @@ def align_robustly(p_R: F64, p_G: F64, *, level: bool) -> F64:
     return T_R_G
 
 
+def align_level(T_R_I: F64, T_G_I: F64) -> F64:
+    """Return T_R_G (7,) between two frames with the same vertical by poses (N, 7), some of them wrong.
+
+    Each pair tells the yaw between the frames. Positions tell it better where they are spread, and
+    nothing where they lie close together: their answer counts if the orientations permit it.
+    """
+    q = so3.multiply(T_R_I[:, :4], so3.inverse(T_G_I[:, :4]))
+    yaw = 2.0 * np.arctan2(q[:, 2], q[:, 3])
+    tried = yaw[:: -(-len(yaw) // _MOST_TRIED)]
+    spread = np.median(np.abs(_turn(yaw[:, None] - tried)), axis=0)
+    turn = _turn(yaw - tried[spread.argmin()])
+    best = tried[spread.argmin()] + np.median(turn)
+    T_R_G = se3.make(so3.exp([0.0, 0.0, best]), np.zeros(3))
+    T_R_G[4:] = np.median(T_R_I[:, 4:] - se3.transform(T_R_G, T_G_I[:, 4:]), axis=0)
+    by_positions = align_robustly(T_R_I[:, 4:], T_G_I[:, 4:], level=True)
+    away = _turn(2.0 * np.arctan2(by_positions[2], by_positions[3]) - best)
+    return by_positions if abs(away) <= 3.0 * float(spread.min()) else T_R_G
+
+
+def _turn(angle: F64) -> F64:
+    """Return angles [rad] between -pi and pi."""
+    return np.asarray((angle + np.pi) % (2.0 * np.pi) - np.pi)
+
+
 def pose_errors(localizations: Localizations, reference: Reference, T_R_G: F64) -> tuple[F64, F64]:
     """Return position [m] and orientation errors [deg] (Q,), NaN where a query was not localised."""
     step = se3.local(reference.T_R_I, se3.compose(T_R_G, localizations.T_G_I))
@@ -235,6 +259,7 @@ def queries(source: QueryVertices, sequence_length: int = 1) -> Iterator[Query]:
 
 
 _MIN_PAIRS = 10
+_MOST_TRIED = 500  # pairs whose yaw is compared with those of all
 
 
 def trajectory_of_queries(
@@ -300,7 +325,12 @@ def _from_answers(reference: Reference, localizations: Localizations, *, level: 
     both = reference.is_known & localizations.is_localized
     if both.sum() < _MIN_PAIRS:
         return None
-    return align_robustly(reference.T_R_I[both, 4:], localizations.T_G_I[both, 4:], level=level)
+    T_R_I, T_G_I = reference.T_R_I[both], localizations.T_G_I[both]
+    return (
+        align_level(T_R_I, T_G_I)
+        if level
+        else align_robustly(T_R_I[:, 4:], T_G_I[:, 4:], level=False)
+    )
 
 
 _HEADER = (

@@ -102,6 +102,10 @@ QUERY_PATH = "the query's own path"
 class _DifferenceReport(LocalizationReport):
     """Result compared with the query's own path, which has errors too."""
 
+    success: int = dataclasses.field(metadata={"title": "near the path"})
+    success_share: float = dataclasses.field(metadata={"title": "share near the path"})
+    wrong: int = dataclasses.field(metadata={"title": "away from the path"})
+    success_error_m: float = dataclasses.field(metadata={"title": "near means below", "unit": "m"})
     position_error_m: Distribution | None = dataclasses.field(
         metadata={"title": "difference", "unit": "m"}
     )

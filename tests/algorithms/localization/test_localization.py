@@ -275,6 +275,22 @@ def test_a_robust_alignment_ignores_wrong_pairs():
         )
 
 
+@pytest.mark.parametrize("size_m", [0.1, 20.0])
+def test_poses_align_level_frames_where_they_lie_close_together_too(size_m: float):
+    rng = np.random.default_rng(5)
+    T_G_I = se3.make(so3.exp(rng.normal(size=(20, 3))), size_m * rng.uniform(-1.0, 1.0, (20, 3)))
+    T_R_G = se3.make(so3.exp([0.0, 0.0, 3.1]), [4.0, 5.0, 6.0])
+    noise = se3.make(
+        so3.exp(rng.normal(scale=0.003, size=(20, 3))), rng.normal(scale=0.02, size=(20, 3))
+    )
+    T_R_I = se3.compose(se3.compose(T_R_G, T_G_I), noise)
+    T_R_I[:6, 4:] += rng.uniform(1.0, 9.0, (6, 3))
+    T_R_I[:6, :4] = so3.exp(rng.normal(size=(6, 3)))
+    error = se3.local(T_R_G, localization.align_level(T_R_I, T_G_I))
+    assert np.linalg.norm(error[:3]) < 0.03
+    assert np.linalg.norm(error[3:]) < 0.004
+
+
 def test_nonsense_is_refused():
     with pytest.raises(FlagError, match="min_inlier_count"):
         LocalizationOptions(min_inlier_count=2)
@@ -298,6 +314,10 @@ def test_errors_are_empty_in_the_table_where_the_frames_are_not_aligned():
     report = localization.describe(database("full"), answers, reference=reference, T_R_G=T_R_G)
     [heads] = [block.heads for block in blocks_of(report) if isinstance(block, Table)]
     assert heads[1:3] == ["difference [m]", "difference [deg]"]
+    facts = str(blocks_of(report))
+    assert "near the path" in facts
+    assert "wrong" not in facts
+    assert "success" not in facts
     of_truth = dataclasses.replace(report, reference="truth")
     [heads] = [block.heads for block in blocks_of(of_truth) if isinstance(block, Table)]
     assert heads[1:3] == ["position error [m]", "orientation error [deg]"]
