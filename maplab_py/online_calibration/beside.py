@@ -150,7 +150,8 @@ class CalibrationBeside:
 
         def joined() -> str:
             newest = self.evaluation
-            return "  ".join(filter(None, (status(), contradicted(newest), newest.missing)))
+            said = status(), contradicted(newest), str(newest.missing or "")
+            return "  ".join(filter(None, said))
 
         return joined
 
@@ -303,7 +304,8 @@ def _notes(status: Status, options: OnlineCalibrationOptions) -> Iterator[str]:
         f"{options.database}, {status.processor_s:.1f} s of processor time"
     )
     if said := contradicted(status):
-        yield f"{said}; {status.missing}" if status.missing else said
+        missing = str(status.missing or "")
+        yield f"{said}; {missing}" if missing else said
     if status.problem:
         yield f"self-calibration: {status.problem}"
     if status.proposal is not None:

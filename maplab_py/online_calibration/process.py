@@ -33,6 +33,7 @@ from maplab_py.frontend.recorded_mission import RecordedMission, mission_map
 from maplab_py.interop.device import RecordedSensors
 from maplab_py.online_calibration.options import OnlineCalibrationOptions
 from maplab_py.online_calibration.suggestions import (
+    known_share,
     simulated_covariances,
     suggestions,
     wanted_sigma,
@@ -75,6 +76,19 @@ class Finish:
 
 
 @dataclasses.dataclass(frozen=True)
+class Missing:
+    """Segments and motion that lead to the wanted deviations."""
+
+    known_share: float
+    segments: str = ""  # their number in words; empty = nothing is missing
+    motion: str = ""  # words of the best one
+
+    def __str__(self) -> str:
+        """Return it in words."""
+        return f"{self.segments} needed; {self.motion}" if self.segments else ""
+
+
+@dataclasses.dataclass(frozen=True)
 class Status:
     """Answer to every request."""
 
@@ -82,7 +96,7 @@ class Status:
     kept: int = 0  # segments in the database
     processor_s: float = 0.0  # of all requests
     contradiction: changes.Contradiction | None = None  # the strongest so far, if significant
-    missing: str = ""  # segments and motion until the wanted deviations
+    missing: Missing | None = None  # None before the first segment
     proposal: reports.SelfCalibrationReport | None = None
     problem: str = ""
 
@@ -252,15 +266,17 @@ class DeviceCalibration:
         sigma = np.sqrt(np.diag(self._covariance()))
         return bool(np.all(sigma[rows] <= self._tolerance[rows]))
 
-    def _missing(self) -> str:
-        """Return how many segments of which motion lead to what is wanted; empty if nothing is missing."""
+    def _missing(self) -> Missing | None:
+        """Return how many segments of which motion lead to what is wanted."""
         if not len(self._parameters) or (self._contradiction is None and not self._evidence):
-            return ""
+            return None
         covariance, rows = self._covariance(), np.arange(len(self._parameters))
         if self._contradiction is not None:
             rows = changes.families(self._parameters)[self._contradiction.family]
-        if np.all(np.sqrt(np.diag(covariance))[rows] <= self._tolerance[rows]):
-            return ""
+        sigma, tolerance = np.sqrt(np.diag(covariance))[rows], self._tolerance[rows]
+        share = known_share(sigma, self._parameters.prior_sigma[rows], tolerance)
+        if np.all(sigma <= tolerance):
+            return Missing(share)
         if self._library is None:
             self._library = simulated_covariances(self._device.sensors, OPTIONS)
         coming = suggestions(covariance, self._library, self._parameters, self._tolerance, rows)
@@ -268,8 +284,8 @@ class DeviceCalibration:
         for suggestion in itertools.islice(coming, _MAX_SUGGESTED):
             needed, motion = needed + 1, motion or suggestion.motion
             if suggestion.is_sufficient:
-                return f"{needed} more segments needed; {motion}"
-        return f"{needed} more segments or more needed; {motion}"
+                return Missing(share, f"{needed} more segments", motion)
+        return Missing(share, f"{needed} more segments or more", motion)
 
     def _finish(self) -> None:
         self._write()

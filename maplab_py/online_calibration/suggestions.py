@@ -130,6 +130,7 @@ class SuggestionReport(Report):
     segments: int  # that are known already
     unknown: tuple[str, ...]  # directions that are known least
     suggestions: tuple[Suggestion, ...]
+    known_share: float  # of the way from no data to the wanted deviations
     sufficient: bool  # all parameters are known as well as wanted
 
 
@@ -167,6 +168,7 @@ def suggest_motion(
         segments=len(evaluation.segments),
         unknown=least_known(covariance, parameters, tolerance),
         suggestions=tuple(chosen),
+        known_share=known_share(sigma, parameters.prior_sigma, tolerance),
         sufficient=bool(np.all(sigma <= tolerance)),
     )
 
@@ -175,6 +177,18 @@ def wanted_sigma(vi_map: VIMap, options: SelfCalibrationOptions, wanted: WantedS
     """Return the wanted deviations (k,) of the parameters of a map."""
     problem = build_segment_problem(vi_map, wanted.as_priors(options), robust=False)
     return problem.parameters.prior_sigma
+
+
+def known_share(sigma: F64, prior_sigma: F64, tolerance: F64) -> float:
+    """Return how far deviations (k,) have come from the prior's to the wanted ones; 1 = all the way.
+
+    The mean over the parameters of the way on a logarithmic scale.
+    """
+    left = np.log(np.maximum(sigma / tolerance, 1.0))
+    whole = np.log(np.maximum(prior_sigma / tolerance, 1.0))
+    share = np.ones(len(left))
+    np.divide(whole - left, whole, out=share, where=whole > 0.0)
+    return float(np.clip(share, 0.0, 1.0).mean())
 
 
 def least_known(

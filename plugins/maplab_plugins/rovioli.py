@@ -105,10 +105,10 @@ def rovioli(
     _check_output(context, run.output)
     key = _new_key(context, map_key, folder := run.output.save_map_folder)
     is_shown, is_live = rovioli_visualize_map or keep_viewer, data.type in TRANSPORTS
-    pictures = _pictures(context, key, map_publish_interval_s) if is_shown else None
     # runs of hours: the map is at the server, and what is there need not stay in memory
     writer = _writer(submaps, forgets=is_live and folder is None)
     beside = _calibration_beside(run, calibration)
+    pictures = _pictures(context, key, map_publish_interval_s, beside) if is_shown else None
     observers: list[Observer] = [each for each in (pictures, writer, beside) if each is not None]
     recording: Recording
     with contextlib.ExitStack() as stack:
@@ -272,13 +272,19 @@ class _Several:
 
 
 class _Pictures:
-    """Shows a run in the viewer: path, landmarks, image with keypoints, and the map it is localised in."""
+    """Shows a run in the viewer: path, landmarks, image with keypoints, and the map it is localised in.
 
-    def __init__(self, viewer: Viewer, title: str, interval_s: float) -> None:
+    Of a device that calibrates itself it shows the motion that is missing too.
+    """
+
+    def __init__(
+        self, viewer: Viewer, title: str, interval_s: float, beside: CalibrationBeside | None
+    ) -> None:
         """Show at most once in an interval."""
         from maplab_py.frontend.live_map import LiveLandmarks, LiveLocalization
 
         self._viewer, self._title, self._interval_s = viewer, title, interval_s
+        self._beside = beside
         self._landmarks, self._localized = LiveLandmarks(), LiveLocalization()
         self._mission, self._next_s = -1, 0.0
 
@@ -301,6 +307,8 @@ class _Pictures:
             return
         self._next_s = now_s + self._interval_s
         self._viewer.show_image(picture_of_tracks(update))
+        if self._beside is not None and (missing := self._beside.evaluation.missing) is not None:
+            self._viewer.motion.show(missing.motion, missing.known_share)
         if mapping.builder is not None:
             with contextlib.suppress(EstimationError):  # there are too few vertices yet
                 live = self._localized
@@ -341,12 +349,14 @@ class _Pictures:
         return subject.replace(options=shown.options)
 
 
-def _pictures(context: CommandContext, title: str, interval_s: float) -> _Pictures:
+def _pictures(
+    context: CommandContext, title: str, interval_s: float, beside: CalibrationBeside | None
+) -> _Pictures:
     from maplab_plugins.visualization.following import ViewerOptions, ensure_viewer
 
     viewer = ensure_viewer(context, ViewerOptions())
     context.terminal.note(f"viewer: {viewer.url}")
-    return _Pictures(viewer, title, interval_s)
+    return _Pictures(viewer, title, interval_s, beside)
 
 
 def _keep_map(

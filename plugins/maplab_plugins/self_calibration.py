@@ -236,24 +236,30 @@ def suggest_motion(
     """Suggest the motions that would teach most about a device, by what its segments leave unknown.
 
     Motions of one segment each are simulated with the sensors of the database; each suggestion follows
-    on those before.
+    on those before. An open viewer shows the first as an arrow, and how much is known as a bar.
 
     Args:
         database: Segment database.
         suggestions: Number of motions.
     """
+    from maplab_plugins.visualization.following import NAME, Following
     from maplab_py.algorithms.self_calibration.segments.database import load_database
     from maplab_py.online_calibration.suggestions import suggest_motion as suggest
 
     if suggestions < 1:
         raise UserError(f"--suggestions={suggestions}: must be 1 or more")
-    return suggest(
+    report = suggest(
         load_database(database, size.max_bytes),
         options,
         wanted,
         count=suggestions,
         progress=context.progress,
     )
+    following = context.session.watchers.find(NAME, Following)
+    if following is not None and not following.viewer.is_stopped:
+        motion = "" if report.sufficient else report.suggestions[0].motion
+        following.viewer.motion.show(motion, report.known_share)
+    return report
 
 
 @command(

@@ -63,7 +63,7 @@ def test_a_wrong_scale_is_found_and_a_calibration_proposed(tmp_path: Path) -> No
     assert found is not None
     assert found.family == "gyroscope scale"
     assert found.since_ns == int(segments[0].recorded.states[0].time_ns[0])
-    assert "more segments needed" in statuses[1].missing
+    assert "more segments needed" in str(statuses[1].missing)
     status = calibration.answer(Finish())
     assert status.proposal is not None
     scales = [

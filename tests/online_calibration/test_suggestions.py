@@ -12,6 +12,7 @@ from maplab_py.online_calibration.options import WantedSigmas
 from maplab_py.online_calibration.process import OPTIONS
 from maplab_py.online_calibration.suggestions import (
     MOTIONS,
+    known_share,
     simulated_segment,
     suggest_motion,
     wanted_sigma,
@@ -35,6 +36,7 @@ def test_three_suggestions_teach_more_than_three_everyday_segments(poor: MotionO
     report = suggest_motion(database, OPTIONS, WantedSigmas())
     assert len(report.suggestions) == 3
     assert not report.sufficient
+    assert 0.0 < report.known_share < 0.9
     evaluation = evaluate(database.vi_map, OPTIONS)
     prior = evaluation.parameters.prior_sigma
     tolerance = wanted_sigma(database.vi_map, OPTIONS, WantedSigmas())
@@ -60,6 +62,13 @@ def test_three_suggestions_teach_more_than_three_everyday_segments(poor: MotionO
     assert sigma[1] < sigma[0] / 3.0
     assert sigma[1] < sigma[2] / 2.0
     assert report.suggestions[0].sigma_before == pytest.approx(sigma[0])
+
+
+def test_the_known_share_grows_from_the_prior_to_what_is_wanted() -> None:
+    prior, wanted = np.array([1.0, 10.0]), np.array([0.01, 0.1])
+    shares = [known_share(sigma * prior, prior, wanted) for sigma in (2.0, 1.0, 0.1, 0.01, 0.001)]
+    assert shares == pytest.approx([0.0, 0.0, 0.5, 1.0, 1.0])
+    assert known_share(np.array([1.0, 0.1]), prior, wanted) == pytest.approx(0.5)
 
 
 def test_an_empty_database_is_refused() -> None:

@@ -20,6 +20,7 @@ from maplab_py.viewer.building import Subject, make_checked_drawing, scene_of
 from maplab_py.viewer.display.camera import Cameras, aim
 from maplab_py.viewer.display.court import Court
 from maplab_py.viewer.display.links import Links
+from maplab_py.viewer.display.motion import MotionRequest
 from maplab_py.viewer.display.panel import Panel
 from maplab_py.viewer.display.parts import Nodes, by_user
 from maplab_py.viewer.display.picture import (
@@ -56,6 +57,7 @@ class Viewer:
         selections: What each page has selected.
         show_image: Shows an image (H, W, 3) in the panel.
         court: Where closures are judged.
+        motion: Asks for the motion that a calibration lacks.
         links: Makes and opens links to a view.
     """
 
@@ -83,6 +85,7 @@ class Viewer:
         self._playback = Playback(self._server, self, self._lock, self._panel.say)
         self._time_machine = TimeMachine(self._server, self.set_state, self._lock, self._panel.say)
         self.court = Court(self._server, self, self._lock, self._panel.say)
+        self.motion = MotionRequest(self._server, self._lock)
         self.links = Links(self._server, self, self._lock, self._panel.view, self._panel.say)
         self._themes = Themes(
             self._server, self._panel.view, self._lock, self._panel.say, is_dark=is_dark
@@ -228,10 +231,9 @@ class Viewer:
         layers = self.visible_layers
         with self._lock, self._nodes.with_hidden(self._draw(scene), layers, self.visible_missions):
             try:
-                with states_to_choose(self._server, self.drawing, self.subject) as chooser:
-                    return export_html(
-                        self._server, scene, layers, path, chooser, is_dark=self.is_dark
-                    )
+                server, is_dark = self._server, self.is_dark
+                with states_to_choose(server, self.drawing, self.subject) as chooser:
+                    return export_html(server, scene, layers, path, chooser, is_dark=is_dark)
             finally:
                 self._cameras.aim_new_pages(scene.extent)
 

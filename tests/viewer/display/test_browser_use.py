@@ -21,6 +21,7 @@ from maplab_py.algorithms.loop_closure.closure_record import (
 from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
 from maplab_py.algorithms.loop_closure.reports import Verdict
 from maplab_py.geometry import se3
+from maplab_py.online_calibration.suggestions import MOTIONS
 from maplab_py.viewer import colours
 from maplab_py.viewer.building import Subject
 from maplab_py.viewer.display import picture
@@ -157,6 +158,28 @@ def test_the_panel_suits_phones_and_its_words_can_be_read(browser: Any) -> None:
         contrasts = page.page.evaluate(_CONTRASTS)
         assert len(contrasts) > 5
         assert min(contrasts) >= 4.5
+    assert page.errors == []
+    viewer.stop()
+    page.page.close()
+
+
+def test_the_motion_that_a_calibration_lacks_is_asked_for(browser: Any) -> None:
+    viewer = Viewer(0)
+    viewer.show(SUBJECT)
+    page = Page(browser, viewer.url, (390, 844))
+    bar = page.page.get_by_role("progressbar", name="calibration known")
+    for words, share, tips in ((MOTIONS[0].words, 0.25, 1), (MOTIONS[4].words, 0.75, 2)):
+        viewer.motion.show(words, share)
+        arrows = page.page.get_by_role("img", name=words)
+        assert page.wait_until(lambda a=arrows: a.count() == 1)
+        assert page.wait_until(lambda a=arrows: (a.bounding_box() or {"height": 0})["height"] > 60)
+        assert arrows.locator("path[marker-end]").count() == tips
+        box, filled = bar.bounding_box(), bar.locator("div").bounding_box()
+        assert filled["width"] == pytest.approx(share * box["width"], abs=2.0)
+        assert box["y"] + box["height"] < 844  # on a phone it can be seen without scrolling
+    viewer.motion.show("", 1.0)
+    assert page.wait_until(lambda: page.page.get_by_text("known as well as wanted").count() == 1)
+    assert page.page.get_by_role("img", name=MOTIONS[4].words).count() == 0
     assert page.errors == []
     viewer.stop()
     page.page.close()
