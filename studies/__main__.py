@@ -9,6 +9,7 @@ python -m studies picture --out=docs/images/segment_information.svg
 python -m studies figures --sets=3 --out=docs/images/self_calibration_figures.svg
 python -m studies borders --sets=4 --out=borders.jsonl
 python -m studies joint_ekf --map=FOLDER --out=FOLDER
+python -m studies tables --sets=3 --out=tables.jsonl
 
 The first four studies append one line per data set and method to a file; a study that was interrupted
 continues. All data sets are recorded with the same device in the same room; motion, noise and appearance
@@ -40,6 +41,7 @@ from studies import (
     predicted_deviations,
     results_page,
     segment_borders,
+    thesis_tables,
 )
 from studies.data_sets import OPTIONS, with_noise
 from studies.selections import JUDGED, METHODS
@@ -70,6 +72,9 @@ def main(words: Sequence[str] | None = None) -> int:
         odometry.measure_odometry(scenario, given.results, given.methods.split(","), given.out)
         return 0
     sets = range(given.first, given.first + given.sets)
+    if given.study == "tables":
+        thesis_tables.measure(thesis_tables.environments(), sets, given.out)
+        return 0
     if given.study == "figures":
         figures.draw(scenario, sets, given.out)
         return 0
@@ -116,6 +121,7 @@ def _parser() -> argparse.ArgumentParser:
         ("predict", 3),
         ("figures", 3),
         ("borders", 10),
+        ("tables", 5),
         ("odometry", 0),
         ("picture", 0),
     ):

@@ -109,7 +109,9 @@ def measure(
         data = DataSet.of(scenario, number) if missing else None
         for method in missing:
             assert data is not None
-            row = _measured(scenario, data, method, per_group, judge if method in judged else None)
+            row = calibrate_segments(
+                scenario, data, method, per_group, judge if method in judged else None
+            )
             append_line(out, row)
             sys.stdout.write(
                 f"{number:3d} {method:26s} NEES {row['nees']:8.1f}  "
@@ -134,11 +136,25 @@ def _segments(scenario: Scenario, data: DataSet, method: str, per_group: int) ->
     return splitting.extract_submap(data.vi_map, np.unique(np.concatenate(rows))), len(rows)
 
 
-def _measured(
-    scenario: Scenario, data: DataSet, method: str, per_group: int, judge: SimulatedData | None
+def calibrate_segments(
+    scenario: Scenario,
+    data: DataSet,
+    method: str,
+    per_group: int,
+    judge: SimulatedData | None = None,
 ) -> Row:
-    submap, count = _segments(scenario, data, method, per_group)
+    """Return the errors of a data set's calibration with a method, as a line of results.
+
+    Args:
+        scenario: Where the data set is from.
+        data: The session.
+        method: As in `measure`.
+        per_group: As in `measure`.
+        judge: Session that evaluates the calibration.
+    """
     began = time.process_time()
+    submap, count = _segments(scenario, data, method, per_group)
+    choice_s, began = time.process_time() - began, time.process_time()
     # parameters that a selection does not contain stay as they were
     error, sigma = data.nominal_error.copy(), np.full(len(data.names), np.nan)
     sensors, row = data.vi_map.sensors, Row(nees=float("nan"))
@@ -166,6 +182,7 @@ def _measured(
         "segments": count,
         "of_segments": len(data.evaluation.segments),
         "cpu_s": time.process_time() - began,
+        "choice_s": choice_s,
         "map_m": None if judge is None else map_error_m(judge, sensors),
         "selection_s_per_segment": data.selection_s,
         **row,

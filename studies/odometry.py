@@ -14,7 +14,7 @@ from maplab_py.algorithms.self_calibration.device import transfer_calibration
 from maplab_py.algorithms.self_calibration.estimation.problem import SegmentProblem
 from maplab_py.algorithms.vi_optimization.solution import with_estimated_sensors
 from maplab_py.array_types import F64
-from maplab_py.geometry import alignment, se3
+from maplab_py.geometry import alignment, se3, so3
 from maplab_py.sensors import SensorSet
 from maplab_py.simulation.scenario import Scenario
 from maplab_py.simulation.simulate import SimulatedData
@@ -56,13 +56,13 @@ def measure_odometry(scenario: Scenario, results: Path, methods: list[str], out:
         number, method = row["set"], row["method"]
         if (number, method) in done:
             continue
-        error_m = _odometry_error_m(session, _sensors_with(true, np.array(row["error"])))
+        error_m, _ = odometry_errors(session, sensors_with(true, np.array(row["error"])))
         append_line(out, {"set": number, "method": method, "vio_m": error_m})
         sys.stdout.write(f"{number:3d} {method:26s} {error_m:.4f} m\n")
         sys.stdout.flush()
 
 
-def _sensors_with(true: SegmentProblem, error: F64) -> SensorSet:
+def sensors_with(true: SegmentProblem, error: F64) -> SensorSet:
     """Return the true calibration changed by an error (k,) of its parameters."""
     states = true.states
     node, direction = true.parameters.nodes(states)
@@ -72,11 +72,14 @@ def _sensors_with(true: SegmentProblem, error: F64) -> SensorSet:
     return with_estimated_sensors(true, moved)
 
 
-def _odometry_error_m(session: SimulatedData, sensors: SensorSet) -> float:
-    """Return the root mean square position error [m] of the filter with a fixed calibration."""
+def odometry_errors(session: SimulatedData, sensors: SensorSet) -> tuple[float, float]:
+    """Return the root mean square errors [m], [deg] of the filter with a fixed calibration."""
     vi_map = transfer_calibration(session.maps[0], sensors)
-    p_G = filter_jointly(vi_map, _FIXED).T_G_I[:, 4:]
+    T_G_I = filter_jointly(vi_map, _FIXED).T_G_I
     row = IdIndex(session.truth.vertex_id).rows(vi_map.vertices.id)
-    p_true = session.truth.T_G_I[row, 4:]
-    aligned = se3.transform(alignment.align_yaw_position(p_true, p_G), p_G)
-    return float(np.sqrt(np.mean(np.sum((aligned - p_true) ** 2, axis=1))))
+    T_true = session.truth.T_G_I[row]
+    T_aligned = se3.compose(alignment.align_yaw_position(T_true[:, 4:], T_G_I[:, 4:]), T_G_I)
+    turned = so3.log(so3.multiply(so3.inverse(T_true[:, :4]), T_aligned[:, :4]))
+    squares = (np.sum(each**2, axis=1) for each in (T_aligned[:, 4:] - T_true[:, 4:], turned))
+    metres, radians = (float(np.sqrt(np.mean(each))) for each in squares)
+    return metres, float(np.rad2deg(radians))
