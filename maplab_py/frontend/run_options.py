@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from maplab_py.algorithms.map_update.options import EvidenceOptions
 from maplab_py.errors import FlagError
 from maplab_py.frontend.localization.options import OnlineLocalizationOptions
 from maplab_py.frontend.odometry_options import OdometryOptions
@@ -88,6 +89,7 @@ class RunOptions(Options):
     builder: MapBuilderOptions = MapBuilderOptions()
     output: OutputOptions = OutputOptions()
     localization: OnlineLocalizationOptions = OnlineLocalizationOptions()
+    evidence: EvidenceOptions = EvidenceOptions()
     realtime_playback_rate: float = option(
         0.0, ge=0, lt=1e6, flag="vio_rosbag_realtime_playback_rate"
     )

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_plugins.map_update import add_evidence, tell_evidence
 from maplab_py.algorithms.localization.options import LocalizationOptions, LocalizationReport
 from maplab_py.algorithms.loop_closure.options import FeatureTypeOptions
+from maplab_py.algorithms.map_update.options import EvidenceOptions
 from maplab_py.input_files import SizeOptions
 from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, UserError, command
 
@@ -47,6 +49,7 @@ def localize(
     *,
     options: LocalizationOptions = LocalizationOptions(),
     features: FeatureTypeOptions = FeatureTypeOptions(),
+    evidence: EvidenceOptions = EvidenceOptions(),
     chosen: MissionChoice = ALL_MISSIONS,
     sequence_length: int = 1,
     success_error_m: float = 0.5,
@@ -57,7 +60,9 @@ def localize(
     overwrite: bool = False,
     size: SizeOptions = SizeOptions(),
 ) -> LocalizationReport:
-    """Localise the images of the selected map in another map, one by one; no map is changed.
+    """Localise the images of the selected map in another map, one by one.
+
+    No map is changed, but for the evidence of --gather_evidence.
 
     Descriptors of one feature type are matched, in a summary map those that it was made from, else
     those of --lc_feature_type; keypoints with others are left out.
@@ -101,6 +106,8 @@ def localize(
         sequence_length=sequence_length,
         progress=context.progress,
     )
+    if evidence.gather_evidence:
+        _add_evidence(context, localization_map, missions, searched)
     reference, T_R_G = _reference(query, localizations, database, searched, ground_truth, truth)
     report = describe(
         database, localizations, reference=reference, T_R_G=T_R_G, success_error_m=success_error_m
@@ -112,6 +119,25 @@ def localize(
         text = report.as_json(indent=2) + "\n"
         write_text(localization_json, [text], overwrite=overwrite)
     return report
+
+
+def _add_evidence(
+    context: CommandContext, name: str, missions: NDArray[np.int64] | None, searched: VIMap | None
+) -> None:
+    """Add what the queries saw and missed to the map in which they are localised."""
+    from maplab_py.algorithms.map_update.update import gather_all
+    from maplab_py.vimap.edits import remove_missions
+
+    if searched is None:
+        raise UserError(f"--gather_evidence wants a map: {name} is a summary map")
+    if name:
+        is_left_out = np.zeros(len(context.vi_map.missions), dtype=np.bool_)
+        if missions is not None:
+            is_left_out[np.setdiff1d(np.arange(len(is_left_out)), missions)] = True
+        add_evidence(context, name, remove_missions(context.vi_map, is_left_out))
+        return
+    report = context.apply(gather_all, missions=missions, progress=context.progress)
+    tell_evidence(context, report, context.map_key)
 
 
 def _database(

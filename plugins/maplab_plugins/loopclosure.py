@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from maplab_plugins.map_update import tell_evidence
 from maplab_py.algorithms.loop_closure.options import FeatureTypeOptions, LoopClosureOptions
+from maplab_py.algorithms.map_update.options import EvidenceOptions
 from maplab_py.algorithms.relaxation.options import RelaxationOptions, RelaxationReport
 from maplab_py.plugin import CommandContext, Message, Report, UserError, command
 from maplab_py.report import counted
@@ -124,6 +126,7 @@ def loopclosure_all_missions(
     context: CommandContext,
     *,
     options: LoopClosureOptions = _LOOPS,
+    evidence: EvidenceOptions = EvidenceOptions(),
     lc_insert_lc_edge_instead_of_merging: bool = False,
     map_mission_list: str = "",
 ) -> LoopClosureReport:
@@ -135,8 +138,16 @@ def loopclosure_all_missions(
         lc_insert_lc_edge_instead_of_merging: Add loop closure edges instead of merging landmarks.
         map_mission_list: Missions to close loops in and between, separated by commas; empty = all.
     """
+    from maplab_py.algorithms.map_update.update import gather_all
+
     missions = context.mission_rows("", map_mission_list)
-    return _close(context, options, missions, as_edges=lc_insert_lc_edge_instead_of_merging)
+    report = _close(context, options, missions, as_edges=lc_insert_lc_edge_instead_of_merging)
+    if evidence.gather_evidence:
+        gathered = context.apply(
+            gather_all, missions=missions, has_new_loops=True, progress=context.progress
+        )
+        tell_evidence(context, gathered, context.map_key)
+    return report
 
 
 @command("loopclosure_one_mission", "lcom", example="lcom --map_mission=59f0")

@@ -15,6 +15,7 @@ from maplab_py.algorithms.map_update.options import (
 )
 from maplab_py.plugin import CommandContext, Message, UserError, command
 from maplab_py.report import counted
+from maplab_py.vimap import VIMap
 
 
 @command(
@@ -96,6 +97,37 @@ def gather_evidence(
     )
     context.commit(result)
     return report
+
+
+def add_evidence(context: CommandContext, name: str, session: VIMap) -> None:
+    """Add the evidence of a session to a map in memory (key), or to one in a folder.
+
+    Raises:
+        UserError: There is none, or none of its missions is anchored.
+    """
+    from maplab_py.algorithms.map_update.update import gather_all
+    from maplab_py.storage.map_saving import save_map
+    from maplab_py.storage.native import disk_copy, load_map
+
+    progress, before = context.progress, disk_copy(Path(name))
+    is_known = name in context.maps
+    vi_map = (
+        context.maps.get(name).vi_map if is_known else load_map(Path(name), progress=progress)[0]
+    )
+    vi_map, report = gather_all(vi_map, session=session, progress=progress)
+    if is_known:
+        context.commit(vi_map, name)
+    elif not context.is_trial:
+        save_map(vi_map, Path(name), known=before.fingerprint, progress=progress)
+    tell_evidence(context, report, name)
+
+
+def tell_evidence(context: CommandContext, report: GatheringReport, name: str) -> None:
+    """Say what evidence has come into a map."""
+    predicted = counted(sum(line.predicted for line in report.sessions), "landmark")
+    matched = sum(line.matched for line in report.sessions)
+    note = f"; {report.note}" if report.note else ""
+    context.terminal.note(f"evidence in {name}: {predicted} expected, {matched} seen{note}")
 
 
 @command("map_log", example="map_log", see_also=("update_map", "map_at"))

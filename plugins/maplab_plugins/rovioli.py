@@ -9,7 +9,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from maplab_plugins.map_update import add_evidence
 from maplab_py.cancellation import ending_early
+from maplab_py.errors import MapError
 from maplab_py.frontend.run_options import DataSourceOptions, RunOptions
 from maplab_py.interop.live.options import TRANSPORTS, LiveOptions, NetworkOptions
 from maplab_py.interop.recordings.options import SourceOptions
@@ -30,7 +32,6 @@ if TYPE_CHECKING:
     from maplab_py.frontend.mapping import Mapping, Observer
     from maplab_py.frontend.odometry_update import OdometryUpdate
     from maplab_py.frontend.reports import MappingReport
-    from maplab_py.frontend.run_options import OutputOptions
     from maplab_py.interop.recordings.protocol import Recording
     from maplab_py.online_calibration.beside import CalibrationBeside
     from maplab_py.server.submap_sources import SubmapWriter
@@ -102,7 +103,7 @@ def rovioli(
     from maplab_py.frontend.finishing import finish
     from maplab_py.frontend.mapping import Mapping, load_kernels
 
-    _check_output(context, run.output)
+    _check_output(context, run)
     key = _new_key(context, map_key, folder := run.output.save_map_folder)
     is_shown, is_live = rovioli_visualize_map or keep_viewer, data.type in TRANSPORTS
     # runs of hours: the map is at the server, and what is there need not stay in memory
@@ -141,7 +142,7 @@ def rovioli(
         finished = finish(mapping, name, map_key=key, progress=progress, is_to_end=is_to_end)
     _tell_end(context, finished, mapping)
     is_at_server = writer is not None and _tell_pushed(context, writer, submaps)
-    _keep_map(context, key, finished, is_at_server=is_at_server)
+    _keep_map(context, key, finished, _evidence_map(run), is_at_server=is_at_server)
     if pictures is not None:
         pictures.after_run(finished, context if keep_viewer else None)
     return finished.report
@@ -158,6 +159,25 @@ def _new_key(context: CommandContext, map_key: str, folder: Path | None) -> str:
     key = map_key or (key_of_folder(folder) if folder is not None else _DEFAULT_KEY)
     context.maps.check_new_key(key)
     return key
+
+
+def _evidence_map(run: RunOptions) -> str:
+    """Return the folder of the map that gets evidence, empty without one.
+
+    Raises:
+        UserError: There is no map to give it to, or none to take it from.
+    """
+    from maplab_py.storage.native import is_map_folder
+
+    if not run.evidence.gather_evidence:
+        return ""
+    folder = run.localization.map_folder
+    if folder is None or not is_map_folder(folder) or not run.output.run_map_builder:
+        raise UserError(
+            "--gather_evidence wants the folder of a map (not of a summary map) as "
+            "--vio_localization_map_folder, and the new map (--rovioli_run_map_builder)"
+        )
+    return str(folder)
 
 
 def _calibration_beside(
@@ -220,15 +240,16 @@ def _run(
     return mapping
 
 
-def _check_output(context: CommandContext, output: OutputOptions) -> None:
+def _check_output(context: CommandContext, run: RunOptions) -> None:
     """Refuse a map folder or files of poses that cannot be written; say if a map is saved nowhere.
 
     Raises:
-        UserError: One of them exists already, or its folder does not.
+        UserError: One of them exists already, or its folder does not; or evidence cannot be kept.
     """
     from maplab_py.storage.native import check_parent, check_target
 
-    folder = output.save_map_folder
+    _evidence_map(run)
+    output, folder = run.output, run.output.save_map_folder
     if folder is None and output.run_map_builder and not context.terminal.is_prompt:
         context.terminal.note(
             "the map stays in memory: --save_map_folder=FOLDER, or save, keeps it"
@@ -360,17 +381,28 @@ def _pictures(
 
 
 def _keep_map(
-    context: CommandContext, key: str, finished: FinishedRun, *, is_at_server: bool
+    context: CommandContext,
+    key: str,
+    finished: FinishedRun,
+    evidence_map: str,
+    *,
+    is_at_server: bool,
 ) -> None:
-    """Add the map of a run, if it has one, to those in memory."""
-    if finished.vi_map is not None:
-        context.maps.add(
-            key,
-            finished.vi_map,
-            folder=finished.report.map_folder,
-            is_saved=finished.disk_copy is not None or is_at_server,
-            disk_copy=finished.disk_copy,
-        )
+    """Add the map of a run, if it has one, to those in memory, and its evidence to another map."""
+    if finished.vi_map is None:
+        return
+    context.maps.add(
+        key,
+        finished.vi_map,
+        folder=finished.report.map_folder,
+        is_saved=finished.disk_copy is not None or is_at_server,
+        disk_copy=finished.disk_copy,
+    )
+    if evidence_map:
+        try:
+            add_evidence(context, evidence_map, finished.vi_map)
+        except (EstimationError, MapError, UserError) as error:  # the new map stays
+            context.terminal.note(f"no evidence for {evidence_map}: {error}")
 
 
 def _tell_end(context: CommandContext, finished: FinishedRun, mapping: Mapping) -> None:

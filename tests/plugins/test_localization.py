@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from maplab_py.algorithms.landmarks.evidence import read_evidence
 from maplab_py.algorithms.summary.options import SummaryMapOptions
 from maplab_py.algorithms.summary.summary import make_summary_map
 from maplab_py.console.session.session import Session
@@ -185,6 +186,24 @@ def test_baselines_run_from_the_console(folders: Path, mode: str) -> None:
     assert report.localization is not None
     assert report.localization.mode == mode
     assert report.localization.localized_share > 0.5
+
+
+def test_what_a_recording_saw_of_the_map_is_noted_in_it(folders: Path, tmp_path: Path) -> None:
+    anchored = walk().vi_map
+    known = np.ones(len(anchored.baseframes), dtype=np.bool_)
+    save_map(
+        anchored.replace(baseframes=anchored.baseframes.replace(is_known=known)), tmp_path / "map"
+    )
+    flags = {"datasource_folder": folders / "query", "gather_evidence": True}
+    with Session() as session:
+        with pytest.raises(UserError, match="--gather_evidence wants the folder of a map"):
+            session.run("rovioli", **flags, vio_localization_map_folder=folders / "summary")
+        session.run("rovioli", **flags, vio_localization_map_folder=tmp_path / "map")
+        session.run("load", map_folder=tmp_path / "map", map_key="map")
+        recent = read_evidence(session.vi_map)["recent"][:, -1]
+        assert np.count_nonzero(recent["predicted"]) > 100
+        assert 0.5 < (recent["matched"] > 0)[recent["predicted"] > 0].mean() <= 1.0
+        assert len(session.vi_map.missions) == len(anchored.missions)
 
 
 def test_without_a_map_nothing_is_said_of_localisation(folders: Path) -> None:

@@ -7,6 +7,13 @@ from maplab_py.options import Options, option
 from maplab_py.report import Report
 
 
+class EvidenceOptions(Options):
+    """Evidence for a map."""
+
+    gather_evidence: bool = False
+    """Note in the map what the session should have seen and saw"""
+
+
 class UpdateOptions(Options, prefix=""):
     """Budget of a map, and when landmarks count as vanished."""
 

@@ -337,6 +337,8 @@ def gather_all(
     persistence: PersistenceOptions = _PERSISTENCE,
     *,
     session: VIMap | None = None,
+    missions: I64 | None = None,
+    has_new_loops: bool = False,
     at_s: float | None = None,
     progress: Progress = SILENT,
 ) -> tuple[VIMap, GatheringReport]:
@@ -345,13 +347,18 @@ def gather_all(
     Args:
         persistence: Priors of existence.
         session: Another map, whose missions give the evidence instead; it does not come into the map.
+        missions: Those (rows) that give the evidence; None = all.
+        has_new_loops: The poses do not fit the landmarks yet: a copy of the map is optimised for it.
         at_s: Time of the probabilities [s since 1970]; None = that of the last mission.
 
     Raises:
         EstimationError: The map has no descriptors.
         MapError: The evidence in the map is damaged.
     """
-    whole, chosen = vi_map, vi_map.missions.id
+    whole, chosen = vi_map, vi_map.missions.id[slice(None) if missions is None else missions]
+    if has_new_loops:
+        options = VIOptimizationOptions(num_iterations=_FIRST_ITERATIONS)
+        whole, _ = optimization.optimize(vi_map, options, progress=progress)
     if session is not None:
         _check_anchored(vi_map)
         session = edits.with_new_ids(session, edits.content_rng(vi_map, "evidence", session))

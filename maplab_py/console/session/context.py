@@ -87,9 +87,9 @@ class CommandContext:
         """The folder of the selected map; None when it was never loaded or saved."""
         return self.maps.selected.folder
 
-    def commit(self, vi_map: VIMap) -> None:
-        """Set the new value of the selected map."""
-        self._drafts[self.maps.selected.key] = vi_map
+    def commit(self, vi_map: VIMap, key: str = "") -> None:
+        """Set the new value of the selected map, or of that of a key."""
+        self._drafts[key or self.maps.selected.key] = vi_map
 
     def apply(
         self,

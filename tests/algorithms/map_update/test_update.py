@@ -11,6 +11,7 @@ from maplab_py.algorithms.landmarks.evidence import (
     has_evidence,
     read_evidence,
     session_times_s,
+    with_evidence,
 )
 from maplab_py.algorithms.landmarks.persistence import PersistenceOptions, existence
 from maplab_py.algorithms.map_update.changes import find_changes
@@ -204,6 +205,32 @@ def test_a_session_gives_evidence_without_coming_into_the_map() -> None:
         np.testing.assert_array_equal(read_evidence(again)[name], read_evidence(result)[name])
     times = read_evidence(again)["recent"]["time_s"]
     assert not ((times[:, 1:] == times[:, :-1]) & (times[:, 1:] > 0)).any()
+
+
+def test_sessions_that_are_localised_or_closed_in_count_once(tmp_path: Path) -> None:
+    session = Session()
+    session.maps.add("map", updated()[0])
+    session.run("save", map_folder=tmp_path / "map")
+    session.maps.add("tuesday", sessions().maps[2])
+    flags = {"localization_map": "map", "gather_evidence": True}
+    session.run("localize", dry_run=True, **flags)
+    assert session.maps.get("map").vi_map is updated()[0]
+    session.run("localize", **flags)
+    noted = read_evidence(session.maps.get("map").vi_map)
+    expected, _ = gather_all(updated()[0], session=sessions().maps[2])
+    np.testing.assert_array_equal(noted, read_evidence(expected))
+    session.run("localize", **flags | {"localization_map": str(tmp_path / "map")})
+    session.run("load", map_folder=tmp_path / "map", map_key="stored")
+    np.testing.assert_array_equal(np.sort(read_evidence(session.vi_map)), np.sort(noted))
+    session.run("update_map", session="tuesday")
+    times = read_evidence(session.vi_map)["recent"]["time_s"]
+    assert not ((times[:, 1:] == times[:, :-1]) & (times[:, 1:] > 0)).any()
+    session.run("gather_evidence", forget=True)
+    hits = [np.count_nonzero(read_evidence(session.vi_map)["recent"]["matched"])]
+    session.maps.add("bare", with_evidence(session.vi_map, None))
+    session.run("lc", gather_evidence=True)
+    hits.append(np.count_nonzero(read_evidence(session.vi_map)["recent"]["matched"]))
+    assert hits[1] > 0.9 * hits[0] > 100
 
 
 def test_a_summary_map_tells_the_probability_of_each_landmark(tmp_path: Path) -> None:
