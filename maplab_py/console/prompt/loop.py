@@ -398,7 +398,5 @@ def greeting() -> list[str]:
         for path in recent_maps()[:_MAX_MAPS]
     ]
     if maps:
-        lines.append(
-            "recent maps: " + " · ".join(f"load {shlex.quote(str(path))}" for path in maps)
-        )
+        lines += ["recent maps:", *(f"  load {shlex.quote(str(path))}" for path in maps)]
     return lines

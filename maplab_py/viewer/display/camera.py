@@ -19,7 +19,7 @@ RIDES = (FREE, BEHIND, INSIDE)
 """Camera mode of a page for a mission that is played."""
 _ASPECT = 1.35
 """Width by height that a view of everything is sure to fit."""
-_MARGIN = 1.08
+_MARGIN = 1.09
 _FREE = 0.74
 """Part of a page's width that the panel leaves free."""
 _FREE_HEIGHT = 0.58
