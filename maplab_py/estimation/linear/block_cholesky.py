@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from maplab_py.array_types import F64, I64
 from maplab_py.estimation.linear import protocol, supernodal_solver
 from maplab_py.estimation.linear.ordering import AUTOMATIC
-from maplab_py.estimation.linear.pattern import BlockPattern, joint_covariance
+from maplab_py.estimation.linear.pattern import BlockPattern
 
 
 class BlockCholesky:
@@ -40,7 +40,7 @@ class BlockCholesky:
             pattern.rows, pattern.cols, num_nodes, node_size, ordering
         )
         self._places = self._solver.places(pattern.rows, pattern.cols)
-        self._values: F64 | None = None
+        self._is_factorised = False
 
     @property
     def statistics(self) -> protocol.FactorStatistics:
@@ -54,35 +54,26 @@ class BlockCholesky:
             NotPositiveDefinite: A pivot is not positive (or not a number).
         """
         checked = self._pattern.check_values(values)
-        self._values = None
+        self._is_factorised = False
         self._solver.clear()
         self._solver.add(self._pattern.rows, self._pattern.cols, self._places, checked)
         self._solver.factorise()
-        self._values = checked
+        self._is_factorised = True
 
-    def solve(self, right_side: F64, *, refinements: int = 0) -> F64:
-        """Return x of A x = b for b (n,) or (n, k), n = num_nodes * node_size.
-
-        Args:
-            right_side: b.
-            refinements: Steps of iterative refinement, x += A^-1 (b - A x).
-        """
-        values = self._factorised()
-        return self._pattern.refined(self._solver.solve, values, right_side, refinements)
-
-    def marginal_covariance(self, nodes: ArrayLike) -> F64:
-        """Return the rows and columns of A^-1 of nodes (k,) in their order, (k * node_size) square."""
-        return joint_covariance(self.solve, nodes, self._pattern.num_nodes, self._pattern.node_size)
+    def solve(self, right_side: F64) -> F64:
+        """Return x of A x = b for b (n,) or (n, k), n = num_nodes * node_size."""
+        self._require_factor()
+        b = self._pattern.check_right_side(right_side)
+        return self._solver.solve(b).reshape(right_side.shape)
 
     def inverse_blocks(self) -> F64:
         """Return A^-1 at every given block, in the layout of `values`; diagonal blocks are full."""
-        self._factorised()
+        self._require_factor()
         return self._solver.inverse_blocks(self._pattern.rows, self._pattern.cols, self._places)
 
-    def _factorised(self) -> F64:
-        if self._values is None:
+    def _require_factor(self) -> None:
+        if not self._is_factorised:
             raise ValueError("factor() has to succeed before the factor can be used")
-        return self._values
 
 
 def compile_kernels() -> None:

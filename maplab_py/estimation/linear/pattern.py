@@ -1,10 +1,9 @@
-"""The block structure of a symmetric matrix, checked, and the product with a vector."""
+"""The block structure of a symmetric matrix, checked."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -59,39 +58,6 @@ class BlockPattern:
             raise ValueError(f"right side has shape {b.shape}, expected ({self.size},) or (.., k)")
         return b.reshape(self.size, -1) if b.ndim == 2 or b.size else b.reshape(0, 1)
 
-    @cached_property
-    def _by_row(self) -> tuple[I64, I64, I32, I64]:
-        """CSR of both triangles: (order into [blocks, transposed blocks], offsets, cols, strict)."""
-        strict = np.flatnonzero(self.rows != self.cols)
-        rows = np.concatenate([self.rows, self.cols[strict]])
-        cols = np.concatenate([self.cols, self.rows[strict]])
-        order = np.argsort(rows, kind="stable")
-        start = np.zeros(self.num_nodes + 1, dtype=np.int64)
-        np.cumsum(np.bincount(rows, minlength=self.num_nodes), out=start[1:])
-        return order, start, cols[order], strict
-
-    def multiply(self, values: F64, x: F64) -> F64:
-        """Return A x for block values (B, d, d) and x (n, k)."""
-        from scipy.sparse import bsr_array
-
-        order, start, cols, strict = self._by_row
-        lower = values.copy()
-        diagonal = np.flatnonzero(self.rows == self.cols)
-        lower[diagonal] = symmetric_of_lower(values[diagonal])
-        both = np.concatenate([lower, values[strict].transpose(0, 2, 1)])[order]
-        matrix = bsr_array((both, cols, start), shape=(self.size, self.size))
-        return np.asarray(matrix @ x)
-
-    def refined(
-        self, solve: Callable[[F64], F64], values: F64, right_side: F64, refinements: int
-    ) -> F64:
-        """Return x of A x = b, in the shape of b, by a solver of (n, k) and steps of refinement."""
-        b = self.check_right_side(right_side)
-        x = solve(b)
-        for _ in range(refinements):
-            x += solve(b - self.multiply(values, x))
-        return x.reshape(right_side.shape)
-
 
 def joint_covariance(
     solve: Callable[[F64], F64], nodes: ArrayLike, num_nodes: int, node_size: int
@@ -103,20 +69,6 @@ def joint_covariance(
     unit[rows, np.arange(len(rows))] = 1.0
     covariance = solve(unit)[rows]
     return np.asarray(0.5 * (covariance + covariance.T))
-
-
-def symmetric_of_lower(blocks: F64) -> F64:
-    """Mirror the lower triangles of blocks (..., d, d) to their upper ones."""
-    lower = np.tril(blocks)
-    return np.asarray(lower + np.swapaxes(np.tril(blocks, -1), -1, -2))
-
-
-def sorted_distinct(keys: I64) -> I64:
-    """Return the distinct keys in ascending order (`np.unique` hashes, which is slower here)."""
-    ordered = np.sort(keys)
-    keep = np.ones(len(ordered), dtype=np.bool_)
-    np.not_equal(ordered[1:], ordered[:-1], out=keep[1:])
-    return ordered[keep]
 
 
 @compiled()

@@ -12,7 +12,8 @@ import numpy as np
 
 from maplab_py.array_types import I32, I64, U64, Mask
 from maplab_py.compilation import compiled
-from maplab_py.estimation.linear.pattern import BlockPattern, sorted_distinct, upper_columns
+from maplab_py.distinct import distinct
+from maplab_py.estimation.linear.pattern import BlockPattern, upper_columns
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -37,7 +38,7 @@ class QuotientGraph:
         first, second = distinct_edges(start, upper, is_first)
         first, second = group[first], group[second]
         key = np.maximum(first, second) * max(count, 1) + np.minimum(first, second)
-        key = sorted_distinct(key)
+        key = distinct(key)
         size = np.bincount(group, minlength=count).astype(np.int64)
         return cls(group, size, key // max(count, 1), key % max(count, 1))
 
@@ -99,8 +100,8 @@ def indistinguishable_nodes(start: I64, upper: I32) -> tuple[I64, int]:
     """
     num_nodes = len(start) - 1
     label = np.random.default_rng(0).integers(1, 2**52, size=num_nodes).astype(np.uint64)
-    distinct, group = np.unique(neighbour_sums(start, upper, label), return_inverse=True)
-    return np.asarray(group, dtype=np.int64), len(distinct)
+    sums, group = np.unique(neighbour_sums(start, upper, label), return_inverse=True)
+    return np.asarray(group, dtype=np.int64), len(sums)
 
 
 @compiled()
