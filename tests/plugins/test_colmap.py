@@ -70,11 +70,6 @@ def test_a_failed_import_changes_nothing(session: Session, tmp_path: Path) -> No
     assert session.maps.selected_key == "scene"
 
 
-def test_a_dry_run_writes_nothing(session: Session, tmp_path: Path) -> None:
-    session.run("export_colmap", colmap_folder=tmp_path / "model", dry_run=True)
-    assert not (tmp_path / "model").exists()
-
-
 def test_maps_that_are_not_there(session: Session) -> None:
     with pytest.raises(UserError, match="neither a map in memory \\(scene\\) nor the folder"):
         session.run("compare_maps", "none")

@@ -254,18 +254,6 @@ def test_evaluation_tells_what_is_missing(folders: Path, tmp_path: Path) -> None
             )  # fmt: skip
 
 
-def test_a_perfect_trajectory_has_no_errors(folders: Path) -> None:
-    with Session() as session:
-        report = session.run(
-            "evaluate_localization", localization_csv=str(folders / "truth.csv"),
-            ground_truth=folders / "truth.csv",
-        )  # fmt: skip
-    errors = report.files[0]
-    assert errors.localized_share == 1.0
-    assert errors.largest_m == pytest.approx(0.0, abs=1e-12)
-    assert np.isclose(errors.first_localized_s, 0.0)
-
-
 def test_the_viewer_shows_the_map_both_paths_and_the_matches(
     folders: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

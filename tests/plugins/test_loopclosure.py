@@ -80,12 +80,6 @@ def test_a_search_without_loops_succeeds_and_says_why(command: str, times: int) 
     np.testing.assert_array_equal(session.vi_map.T_G_I, before)
 
 
-def test_seed_and_gates_are_flags() -> None:
-    session = session_of(TWICE)
-    report = session.run("lc", lc_seed=7, lc_min_inlier_count=1000)
-    assert "needed 1000" in report.reason
-
-
 def test_closures_are_listed_removed_and_forgotten(tmp_path: Path) -> None:
     session = session_of(TWICE)
     assert "lc" in session.run("lc_report").notes[0]
@@ -173,14 +167,6 @@ def test_a_projection_is_trained_and_used(tmp_path: Path) -> None:
     assert coarse.accepted > 0.8 * plain.accepted
 
 
-def test_a_projection_for_other_descriptors_is_told(tmp_path: Path) -> None:
-    np.savez(tmp_path / "short.npz", matrix=np.ones((10, 64)))
-    session = session_of(TWICE)
-    report = session.run("lc", lc_projection_matrix_filename=str(tmp_path / "short.npz"))
-    assert report.accepted > 0
-    assert "learned a projection from the map" in report.notes[0]
-
-
 SCENARIO = """
 name: lidar
 world: {landmarks_per_room: 800}
@@ -230,13 +216,6 @@ def test_clouds_straighten_a_map(session: Session, simulated: Path, tmp_path: Pa
     assert removed.edges_removed == 1
 
 
-def test_undo_takes_the_edges_away(session: Session) -> None:
-    before = session.vi_map
-    session.run("register_point_clouds", lidar_lc_every_nth=2)
-    session.run("undo")
-    assert session.vi_map is before
-
-
 def test_wrong_values_are_refused(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(FlagError, match="lidar_lc_voxel_size_m"):
         session.run("lc_lidar", lidar_lc_voxel_size_m=0.0)
@@ -276,16 +255,6 @@ def test_the_argument_is_resolved(closed_rooms: Session) -> None:
     assert isinstance(closed_rooms.run("why", "tue"), explanation.MissionExplanation)
     assert isinstance(closed_rooms.run("why", "monday", "tuesday"), explanation.PairExplanation)
     assert isinstance(closed_rooms.run("why", landmark), LandmarkExplanation)
-
-
-def test_flags_show_what_they_would_decide(closed_rooms: Session) -> None:
-    closure = to_hex(closure_record.read_record(closed_rooms.vi_map).closures.id[0])[:8]
-    strict = closed_rooms.run("why", closure, lc_min_inlier_count=1000)
-    assert [line["flag"] for line in strict.as_dict()["gates"] if line["result"] == "failed"] == [
-        "--lc_min_inlier_count"
-    ]
-    usual = closed_rooms.run("why", closure)
-    assert "would pass" in usual.as_dict()["summary"]
 
 
 def test_wrong_arguments(closed_rooms: Session) -> None:

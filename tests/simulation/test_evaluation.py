@@ -182,16 +182,6 @@ def test_truth_of_another_data_set_makes_no_true_map() -> None:
         true_map(simulated().maps[0], other.truth)
 
 
-def test_the_frame_of_the_map_does_not_matter(right: VIMap, data: SimulatedData) -> None:
-    turn = se3.make(so3.exp([0.0, 0.0, 2.0]), np.array([10.0, -3.0, 1.0]))
-    frames = right.baseframes.replace(T_G_M=se3.compose(turn, right.baseframes.T_G_M))
-    errors = _errors(right.replace(baseframes=frames), data)
-    assert errors.ate_m < 1e-9
-    assert errors.landmark_90_percent_m is not None
-    assert errors.landmark_90_percent_m < 1e-9
-    assert errors.heading_deg < 1e-5
-
-
 def _true_map() -> VIMap:
     """Return the merged map with true poses, in a frame of its own."""
     merged, _ = merge.merge_maps(*simulated().maps)

@@ -15,7 +15,7 @@ from maplab_py.geometry import se3, so3
 from maplab_py.interop import imu_csv, trajectories
 from maplab_py.sensors import Camera, Distortion, Projection, projection
 from maplab_py.simulation import scenario as sim
-from maplab_py.simulation import scenario_file, shading_kernels
+from maplab_py.simulation import shading_kernels
 from maplab_py.simulation.cameras import pixels_of
 from maplab_py.simulation.imaging import Brightness, Imager, pixel_rays
 from maplab_py.simulation.raw_data import write_mesh, write_raw_data
@@ -359,16 +359,6 @@ def test_raw_data_are_euroc_folders(tmp_path: Path) -> None:
         write_raw_data(_raw_scenario(), data, tmp_path)
 
 
-def test_same_images_again(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        write_raw_data(_raw_scenario(), simulate(_raw_scenario()), tmp_path / name)
-    files = sorted(path for path in (tmp_path / "a").rglob("*") if path.is_file())
-    assert len(files) > 12
-    for path in files:
-        other = tmp_path / "b" / path.relative_to(tmp_path / "a")
-        assert path.read_bytes() == other.read_bytes()
-
-
 def test_mesh_has_its_normals_in_the_free_space(tmp_path: Path) -> None:
     surfaces = scene().surfaces
     write_mesh(surfaces, tmp_path / "mesh.ply")
@@ -403,9 +393,3 @@ def test_the_command_writes_raw_data_when_asked(tmp_path: Path) -> None:
     assert (report.raw_data[0] / "mav0" / "imu0" / "data.csv").is_file()
     # this scenario renders no images
     assert not (report.raw_data[0] / "mav0" / "cam0" / "data").exists()
-
-
-def test_the_scenario_of_images_renders() -> None:
-    scenario = scenario_file.load_scenario("stereo_room")
-    assert scenario.images.render
-    assert len(scenario.cameras) == 2

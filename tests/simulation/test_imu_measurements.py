@@ -71,53 +71,6 @@ def _prediction_errors(rate_hz: float) -> tuple[float, float, float]:
     )
 
 
-def _reference_errors(rate_hz: float) -> tuple[float, float, float]:
-    """Return the same errors when the samples, joined by straight lines, are integrated by RK4."""
-    motion = _motion(rate_hz)
-    samples = measure(
-        dataclasses.replace(QUIET, rate_hz=rate_hz), IDEAL, motion, np.random.default_rng(0)
-    ).accel_gyro
-    stride, dt = int(0.1 * rate_hz), 1.0 / rate_hz
-    first = np.arange(0, len(motion.v_G) - stride, stride)
-    q, v, p = motion.T_G_I[first, :4], motion.v_G[first], motion.T_G_I[first, 4:]
-    for step in range(stride):
-        before, after = samples[first + step], samples[first + step + 1]
-
-        def slope(state: list[np.ndarray], s: float) -> list[np.ndarray]:
-            q, v = state[0], state[1]
-            reading = before + s * (after - before)  # noqa: B023
-            rate = np.concatenate([reading[:, 3:], np.zeros((len(q), 1))], axis=1)
-            force = so3.rotate(so3.normalize(q), reading[:, :3])
-            return [0.5 * so3.multiply(q, rate), force + GRAVITY, v]
-
-        state = [q, v, p]
-        a = slope(state, 0.0)
-        b = slope([x + 0.5 * dt * d for x, d in zip(state, a, strict=True)], 0.5)
-        c = slope([x + 0.5 * dt * d for x, d in zip(state, b, strict=True)], 0.5)
-        d = slope([x + dt * d for x, d in zip(state, c, strict=True)], 1.0)
-        q, v, p = (
-            x + dt / 6.0 * (ka + 2.0 * kb + 2.0 * kc + kd)
-            for x, ka, kb, kc, kd in zip(state, a, b, c, d, strict=True)
-        )
-        q = so3.normalize(q)
-    last = first + stride
-    turn = so3.multiply(so3.inverse(q), motion.T_G_I[last, :4])
-    return (
-        float(np.linalg.norm(p - motion.T_G_I[last, 4:], axis=1).max()),
-        float(np.linalg.norm(v - motion.v_G[last], axis=1).max()),
-        float(np.linalg.norm(so3.log(turn), axis=1).max()),
-    )
-
-
-def test_what_a_prediction_misses_is_sampling() -> None:
-    coarse, fine = _reference_errors(200.0), _reference_errors(400.0)
-    assert coarse[0] < 1e-6
-    assert coarse[1] < 2e-5
-    assert coarse[2] < 5e-5
-    for slow, fast in zip(coarse, fine, strict=True):
-        assert slow >= 3.99 * fast
-
-
 def test_the_estimators_prediction_errors_are_small_and_fall_with_the_rate() -> None:
     coarse, fine = _prediction_errors(200.0), _prediction_errors(400.0)
     assert coarse[0] < 1e-6
@@ -141,20 +94,6 @@ def test_ideal_imu_needs_no_intrinsics() -> None:
     skewed = intrinsics_of(SKEWED)
     assert skewed is not None
     assert np.all(np.tril(skewed.T_g, -1) == 0.0)
-
-
-@pytest.mark.parametrize(
-    ("columns", "density"),
-    [(slice(0, 3), "accel_noise_density"), (slice(3, 6), "gyro_noise_density")],
-)
-def test_noise_has_its_density(columns: slice, density: str) -> None:
-    options = dataclasses.replace(QUIET, **{density: 1e-3})
-    motion = _motion(200.0, 60.0)
-    noisy = measure(options, IDEAL, motion, np.random.default_rng(5)).accel_gyro
-    clean = measure(QUIET, IDEAL, motion, np.random.default_rng(5)).accel_gyro
-    sigma = np.std((noisy - clean)[:, columns])
-    # 36000 values: the standard deviation is known to 0.4 %
-    assert sigma == pytest.approx(1e-3 * np.sqrt(200.0), rel=0.015)
 
 
 def test_biases_walk_as_told() -> None:
@@ -228,19 +167,6 @@ def test_bias_walk_grows_with_the_root_of_the_time(first: int, name: str) -> Non
     slope = np.polyfit(np.log(time), np.log(deviation), 1)[0]
     np.testing.assert_allclose(slope, 0.5, atol=0.05)
     np.testing.assert_allclose(deviation[:2] / np.sqrt(time[:2, None] / 3.0), walk, rtol=0.1)
-
-
-def test_noise_and_walk_cross_where_their_densities_say() -> None:
-    rate_hz = 20.0
-    options = dataclasses.replace(
-        NOISELESS, rate_hz=rate_hz, gyro_noise_density=1e-3, gyro_bias_walk=1e-4
-    )
-    signal = _measured(options, _at_rest(5000.0, rate_hz))[:, 3:]
-    clusters = np.unique(np.geomspace(10, 4000, 25).astype(int))
-    deviation = np.array([_allan_deviation(signal, n).mean() for n in clusters])
-    # N / sqrt(t) = K sqrt(t / 3) at t = sqrt(3) N / K
-    lowest = clusters[np.argmin(deviation)] / rate_hz
-    assert np.sqrt(3.0) * 10.0 / 2.0 < lowest < np.sqrt(3.0) * 10.0 * 2.0
 
 
 def test_gyroscope_that_feels_acceleration() -> None:
