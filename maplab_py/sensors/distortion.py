@@ -1,19 +1,14 @@
-"""Lens distortion on the z = 1 plane with Jacobians, and undistortion.
+"""Lens distortion on the z = 1 plane, and undistortion.
 
-All radial models are written x_d = s(r) x with r = |x|, so that with s' = ds/dr
-dx_d/dx = s I + (s'/r) x x^T, where s and s'/r are smooth at r = 0.
+All radial models are written x_d = s(r) x with r = |x|, where s is smooth at r = 0.
 """
 
 import functools
-from collections.abc import Callable
 
 import numpy as np
 
 from maplab_py.array_types import F64, Mask
 from maplab_py.sensors.camera import Distortion
-
-Distorted = tuple[F64, F64, F64]
-"""Distorted points (..., 2), d/dx (..., 2, 2), d/dparameters (..., 2, n)."""
 
 _SMALL_RADIUS = 1e-3
 """Below this radius series replace quotients by r with an error below 1e-12."""
@@ -26,16 +21,15 @@ _BLOCK = 4096
 """Points that are undistorted together."""
 
 
-def distort(kind: Distortion, parameters: F64, x: F64) -> Distorted:
-    """Distort points (..., 2) of the z = 1 plane and differentiate."""
-    return _FORWARD[kind](parameters, x)
-
-
-def distorted(kind: Distortion, parameters: F64, x: F64) -> F64:
-    """Distort points (..., 2) of the z = 1 plane, as `distort` does."""
-    if _FORWARD[kind] is _brown:
-        return _brown(parameters, x, with_jacobians=False)[0]
-    return distort(kind, parameters, x)[0]
+def distort(kind: Distortion, parameters: F64, x: F64) -> F64:
+    """Distort points (..., 2) of the z = 1 plane."""
+    if kind is Distortion.NONE:
+        return x
+    if kind is Distortion.EQUIDISTANT:
+        return _equidistant(parameters, x)
+    if kind is Distortion.FOV:
+        return _fov(parameters, x)
+    return _brown(parameters, x)
 
 
 def undistort(kind: Distortion, parameters: F64, x_d: F64) -> tuple[F64, Mask]:
@@ -96,18 +90,6 @@ def _first_root(ascending: tuple[float, ...]) -> float:
     return float(positive.min()) if len(positive) else float(np.inf)
 
 
-def _none(parameters: F64, x: F64) -> Distorted:
-    J = np.broadcast_to(np.eye(2), (*x.shape[:-1], 2, 2))
-    return x, J, np.zeros((*x.shape, len(parameters)))
-
-
-def _radial(x: F64, s: F64, ds_over_r: F64, ds_dparameters: F64) -> Distorted:
-    """Assemble x_d = s x; s, ds_over_r (...,), ds_dparameters (..., n)."""
-    J = s[..., None, None] * np.eye(2)
-    J = J + ds_over_r[..., None, None] * x[..., :, None] * x[..., None, :]
-    return s[..., None] * x, J, x[..., :, None] * ds_dparameters[..., None, :]
-
-
 def _radial_factor(k: tuple[float, ...], r2: F64) -> tuple[F64, F64, F64 | float]:
     """Return Brown's s, 2 ds/dr^2, and the denominator of s; parameters as `_brown` has them."""
     k1, k2 = k[:2]
@@ -123,38 +105,18 @@ def _radial_factor(k: tuple[float, ...], r2: F64) -> tuple[F64, F64, F64 | float
     return s, (slope - s * (2.0 * k4 + r2 * (4.0 * k5 + 6.0 * k6 * r2))) / below, below
 
 
-def _tangential(p1: float, p2: float, u: F64, v: F64, r2: F64) -> F64:
-    """Return what Brown's model adds to radially distorted points (..., 2)."""
-    uv = u * v
-    along_u = 2.0 * p1 * uv + p2 * (r2 + 2.0 * u * u)
-    return np.stack([along_u, p1 * (r2 + 2.0 * v * v) + 2.0 * p2 * uv], axis=-1)
-
-
-def _brown(parameters: F64, x: F64, *, with_jacobians: bool = True) -> Distorted:
+def _brown(parameters: F64, x: F64) -> F64:
     """Brown's model, k1 k2 p1 p2 and perhaps k3 or k3 k4 k5 k6, as OpenCV orders them."""
     k = tuple(float(value) for value in parameters)
     p1, p2 = k[2:4]
     u, v = x[..., 0], x[..., 1]
     r2, uv = u * u + v * v, u * v
-    s, slope, below = _radial_factor(k, r2)
-    if not with_jacobians:
-        return s[..., None] * x + _tangential(p1, p2, u, v, r2), x, x
-    powers = [r2 / below, r2**2 / below, *([r2**3 / below] if len(k) > 4 else [])]
-    powers += [-s * power for power in powers] if len(k) > 5 else []
-    radial, J, d_radial = _radial(x, s, slope, np.stack(powers, axis=-1))
-    tangential = _tangential(p1, p2, u, v, r2)
-    J[..., 0, 0] += 2.0 * p1 * v + 6.0 * p2 * u
-    J[..., 0, 1] += 2.0 * p1 * u + 2.0 * p2 * v
-    J[..., 1, 0] += 2.0 * p1 * u + 2.0 * p2 * v
-    J[..., 1, 1] += 6.0 * p1 * v + 2.0 * p2 * u
-    d_p1 = np.stack([2.0 * uv, r2 + 2.0 * v * v], axis=-1)
-    d_p2 = np.stack([r2 + 2.0 * u * u, 2.0 * uv], axis=-1)
-    d_tangential = np.stack([d_p1, d_p2], axis=-1)
-    columns = [d_radial[..., :2], d_tangential, d_radial[..., 2:]]
-    return radial + tangential, J, np.concatenate(columns, axis=-1)
+    along_u = 2.0 * p1 * uv + p2 * (r2 + 2.0 * u * u)
+    tangential = np.stack([along_u, p1 * (r2 + 2.0 * v * v) + 2.0 * p2 * uv], axis=-1)
+    return np.asarray(_radial_factor(k, r2)[0][..., None] * x + tangential)
 
 
-def _equidistant(parameters: F64, x: F64) -> Distorted:
+def _equidistant(parameters: F64, x: F64) -> F64:
     """Kannala and Brandt, PAMI 2006: r_d = theta (1 + k1 theta^2 + ... + k4 theta^8)."""
     k = parameters
     r = np.linalg.norm(x, axis=-1)
@@ -163,47 +125,22 @@ def _equidistant(parameters: F64, x: F64) -> Distorted:
     theta = np.arctan(r)
     ratio = np.where(small, 1.0 - r**2 / 3.0 + r**4 / 5.0, theta / safe)
     powers = theta[..., None] ** np.array([2, 4, 6, 8])
-    s = ratio * (1.0 + powers @ k)
-    dr_d = (1.0 + powers @ (k * np.array([3.0, 5.0, 7.0, 9.0]))) / (1.0 + r**2)
-    series = 2.0 * (k[0] - 1.0 / 3.0) + 4.0 * (0.2 - k[0] + k[1]) * r**2
-    ds_over_r = np.where(small, series, (dr_d - s) / safe**2)
-    return _radial(x, s, ds_over_r, ratio[..., None] * powers)
+    return np.asarray((ratio * (1.0 + powers @ k))[..., None] * x)
 
 
-def _fov(parameters: F64, x: F64) -> Distorted:
+def _fov(parameters: F64, x: F64) -> F64:
     """Devernay and Faugeras, MVA 2001: r_d = atan(2 r tan(w/2)) / w, as maplab's fisheye."""
     w = float(parameters[0])
     r = np.linalg.norm(x, axis=-1)
     if abs(w) < _SMALL_FOV_RAD:
         # r_d = r (1 + w^2 (1/12 - r^2/3)) + O(w^4)
-        expansion = 1.0 / 12.0 - r**2 / 3.0
-        return _radial(
-            x,
-            1.0 + w**2 * expansion,
-            np.full_like(r, -2.0 / 3.0 * w**2),
-            (2.0 * w * expansion)[..., None],
-        )
+        return np.asarray((1.0 + w**2 * (1.0 / 12.0 - r**2 / 3.0))[..., None] * x)
     m = 2.0 * np.tan(0.5 * w)
     small = r < _SMALL_RADIUS
     safe = np.where(small, 1.0, r)
     u = m * r
-    slope = m / (w * (1.0 + u**2))
     s = np.where(small, m / w * (1.0 - u**2 / 3.0 + u**4 / 5.0), np.arctan(u) / (w * safe))
-    series = m**3 / w * (-2.0 / 3.0 + 0.8 * u**2)
-    ds_over_r = np.where(small, series, (slope - s) / safe**2)
-    # dm/dw = 1 + tan(w/2)^2
-    ds_dw = -s / w + (1.0 + 0.25 * m**2) / (w * (1.0 + u**2))
-    return _radial(x, s, ds_over_r, ds_dw[..., None])
-
-
-_FORWARD: dict[Distortion, Callable[[F64, F64], Distorted]] = {
-    Distortion.NONE: _none,
-    Distortion.RADTAN: _brown,
-    Distortion.RADTAN5: _brown,
-    Distortion.RATIONAL: _brown,
-    Distortion.EQUIDISTANT: _equidistant,
-    Distortion.FOV: _fov,
-}
+    return np.asarray(s[..., None] * x)
 
 
 def _undistort_fov(parameters: F64, x_d: F64) -> tuple[F64, Mask]:

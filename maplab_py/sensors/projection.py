@@ -1,4 +1,4 @@
-"""Points to pixels and pixels to rays, with exact Jacobians, for every camera model of the format.
+"""Points to pixels and pixels to rays, for every camera model of the format.
 
 Parameters are ordered [intrinsics..., distortion...] as in `Camera`. All projections have the form
 x = p / D(p):
@@ -27,40 +27,10 @@ def project(camera: Camera, p_C: ArrayLike) -> tuple[F64, Mask]:
     are not visible are finite but without meaning.
     """
     _, focal, centre = _intrinsics(camera)
-    x, _, visible = _normalise(camera, np.asarray(p_C, dtype=np.float64))
+    x, visible = _normalise(camera, np.asarray(p_C, dtype=np.float64))
     x = np.where(visible[..., None], x, 0.0)
-    x_d = distortion.distorted(camera.distortion, camera.distortion_parameters, x)
+    x_d = distortion.distort(camera.distortion, camera.distortion_parameters, x)
     return focal * x_d + centre, visible
-
-
-def project_with_jacobians(camera: Camera, p_C: ArrayLike) -> tuple[F64, F64, F64, Mask]:
-    """Return pixels and their derivatives.
-
-    Args:
-        camera: Camera of n parameters.
-        p_C: Points (..., 3) in the camera frame [m].
-
-    Returns:
-        uv (..., 2), d uv / d p_C (..., 2, 3), d uv / d parameters (..., 2, n), visible (...,).
-        Values of points that are not visible are finite but without meaning.
-    """
-    p = np.asarray(p_C, dtype=np.float64)
-    mirror, focal, centre = _intrinsics(camera)
-    x, denominator, visible = _normalise(camera, p)
-    x = np.where(visible[..., None], x, 0.0)
-    x_d, dx_d_dx, dx_d_dk = distortion.distort(camera.distortion, camera.distortion_parameters, x)
-
-    near = np.where(visible[..., None], p, [0.0, 0.0, 1.0])
-    slope, dD_dmirror = _denominator_slopes(camera.projection, mirror, near)
-    dx_dp = (np.eye(2, 3) - x[..., :, None] * slope[..., None, :]) / denominator[..., None, None]
-    duv_dx = focal[:, None] * dx_d_dx
-    columns = [focal[:, None] * dx_d_dk]
-    columns.insert(0, np.broadcast_to(np.eye(2), (*x.shape, 2)))
-    columns.insert(0, x_d[..., :, None] * np.eye(2))
-    if len(mirror):
-        dx_dmirror = -x[..., :, None] * (dD_dmirror / denominator[..., None])[..., None, :]
-        columns.insert(0, duv_dx @ dx_dmirror)
-    return focal * x_d + centre, duv_dx @ dx_dp, np.concatenate(columns, axis=-1), visible
 
 
 def visibility_limits(camera: Camera) -> F64:
@@ -106,8 +76,8 @@ def _intrinsics(camera: Camera) -> tuple[tuple[float, ...], F64, F64]:
     return tuple(values[:-4].tolist()), values[-4:-2], values[-2:]
 
 
-def _normalise(camera: Camera, p: F64) -> tuple[F64, F64, Mask]:
-    """Return x (..., 2), D(p) (...,), 1 where it is not positive, and which points are visible."""
+def _normalise(camera: Camera, p: F64) -> tuple[F64, Mask]:
+    """Return x (..., 2) and which points are visible (...,)."""
     limit = distortion.largest_radius(camera.distortion, camera.distortion_parameters)
     with np.errstate(over="ignore", invalid="ignore"):  # no camera sees points beyond 1e154 m
         length = np.linalg.norm(p, axis=-1)
@@ -115,7 +85,7 @@ def _normalise(camera: Camera, p: F64) -> tuple[F64, F64, Mask]:
         visible = (denominator > _MIN_DENOMINATOR) & (p[..., 2] > -_cone(camera) * length)
         denominator = np.where(visible, denominator, 1.0)
         x = p[..., :2] / denominator[..., None]
-        return x, denominator, visible & (np.linalg.norm(x, axis=-1) < limit)
+        return x, visible & (np.linalg.norm(x, axis=-1) < limit)
 
 
 def _denominator(projection: Projection, mirror: tuple[float, ...], p: F64, length: F64) -> F64:
@@ -129,35 +99,6 @@ def _denominator(projection: Projection, mirror: tuple[float, ...], p: F64, leng
         alpha, beta = mirror
         return np.asarray(alpha * np.sqrt(beta * square + z * z) + (1.0 - alpha) * z)
     return np.asarray(z + mirror[0] * length if mirror else z)
-
-
-def _denominator_slopes(
-    projection: Projection, mirror: tuple[float, ...], p: F64
-) -> tuple[F64, F64]:
-    """Return d D / d p (..., 3) and d D / d mirror (..., m)."""
-    if projection is Projection.EXTENDED_UNIFIED:
-        alpha, beta = mirror
-        scaled = p * np.array([beta, beta, 1.0])
-        length = np.sqrt(np.sum(scaled * p, axis=-1))
-        slope = alpha * scaled / _positive(length)[..., None]
-        slope[..., 2] += 1.0 - alpha
-        by_beta = 0.5 * alpha * (p[..., 0] ** 2 + p[..., 1] ** 2) / _positive(length)
-        return slope, np.stack([length - p[..., 2], by_beta], axis=-1)
-    xi = mirror[0] if mirror else 0.0
-    length = np.linalg.norm(p, axis=-1)
-    slope = xi * p / _positive(length)[..., None]
-    slope[..., 2] += 1.0
-    if projection is not Projection.DOUBLE_SPHERE:
-        return slope, length[..., None]
-    alpha, k = mirror[1], p[..., 2] + xi * length
-    second = np.sqrt(p[..., 0] ** 2 + p[..., 1] ** 2 + k * k)
-    of_k = alpha * k / _positive(second) + 1.0 - alpha
-    of_xy = p * np.array([1.0, 1.0, 0.0]) * (alpha / _positive(second))[..., None]
-    return of_xy + of_k[..., None] * slope, np.stack([of_k * length, second - k], axis=-1)
-
-
-def _positive(length: F64) -> F64:
-    return np.where(length > 0.0, length, 1.0)
 
 
 def _cone(camera: Camera) -> float:

@@ -21,6 +21,7 @@ from maplab_py.estimation.terms.visual import Observations, VisualTerms
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import CameraRig, Imu, projection
 from maplab_py.vimap import VIMap
+from studies.ekf_tracks import pixel_slopes
 
 F64 = NDArray[np.float64]
 
@@ -97,7 +98,7 @@ class DenseProblem:
             T_G_I = states.T_G_I[data.vertex[own]]
             p_I = se3.transform(se3.inverse(T_G_I), states.p_G[data.landmark[own]])
             T_C_I = se3.inverse(self.rig.T_B_C[row])
-            _, by_p_C, _, _ = projection.project_with_jacobians(camera, se3.transform(T_C_I, p_I))
+            by_p_C = pixel_slopes(camera, se3.transform(T_C_I, p_I))
             by_p_I = by_p_C @ so3.to_matrix(T_C_I[:4])
             point[own] = by_p_I @ so3.to_matrix(so3.inverse(T_G_I[:, :4]))
             pose[own, :, :3] = -point[own]
