@@ -37,6 +37,8 @@ _SETTLING_NS = 250_000_000
 _MOST_NOTES = 8
 _LOST_SHARE, _LOST_NS = 0.2, 600_000_000
 """A camera that sees so small a share of the points of its leader, for so long, compared with before."""
+_MISFIT, _FIT_RAD = 2.0, 1e-4
+"""Points so many times as far as usual from where they should be tell as much less of the motion."""
 _MISFIT_RAD = 0.01
 """Points of a camera are so far from where those of all cameras are seen."""
 _GYROSCOPE = (ImuPart.GYROSCOPE,)
@@ -96,6 +98,7 @@ class SensorWatch:
         """Forget the motion, and use the whole IMU; the estimator starts again."""
         self._comparison = MotionComparison(self._device, self._imu)
         self._usual = {part: _Usual() for part in PARTS}
+        self._fits_rad: collections.deque[float] = collections.deque(maxlen=_REMEMBERED)
         self._shares: collections.deque[float] = collections.deque(maxlen=_REMEMBERED)
         self._lost_since_ns = 0
         for name in [name for name in self._open if not name.startswith("camera")]:
@@ -321,7 +324,7 @@ class SensorWatch:
     ) -> bool:
         """Return whether a part of the IMU agrees with the images; leave it out if not for long."""
         usual, error = self._usual[part], _of(new, part)
-        if usual.add(part, error, _SIGMAS * new.sigma[part]) <= 1.0:
+        if usual.add(part, error, _SIGMAS * new.sigma[part] * self._misfit(new)) <= 1.0:
             usual.since_ns, usual.bias = new.since_ns, new.biases[part]
             return True
         if usual.in_row >= _IN_ROW:
@@ -334,6 +337,20 @@ class SensorWatch:
             usual.in_row = 0
             usual.recent.clear()
         return False
+
+    def _misfit(self, new: Disagreement) -> float:
+        """Return how many times as far as usual the points are from where they should be; 1 if it is usual.
+
+        The poses follow from them alone, so a failed IMU does not move them away; the last points that are
+        left of a view may be wrong together.
+        """
+        fit_rad = float(np.nanmedian(new.fit_rad))
+        is_known = len(self._fits_rad) >= _FEWEST
+        usual_rad = max(float(np.median(self._fits_rad)) if is_known else fit_rad, _FIT_RAD)
+        if fit_rad > _MISFIT * usual_rad:
+            return fit_rad / usual_rad
+        self._fits_rad.append(fit_rad)
+        return 1.0
 
     def _reconsider(
         self, failure: SensorFailure, part: ImuPart, new: Disagreement, now_ns: int

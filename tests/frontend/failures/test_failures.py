@@ -188,10 +188,29 @@ def test_a_shifted_camera_is_told_from_a_wrong_gyroscope(kind: str) -> None:
     assert watch.left_out == (frozenset([1]) if kind == "camera 1" else frozenset())
 
 
+@pytest.mark.parametrize("noise_px", [0.0, 0.5])
+def test_points_that_scatter_accuse_no_gyroscope(noise_px: float) -> None:
+    rng, watch, frame, window = np.random.default_rng(6), _watch(), _frame(), _window()
+    first_px = frame.uv_px[:24].copy()
+    for row in range(1, 100):
+        samples = _resting(rng)
+        if row > 80:  # the last points of a view turn about the optical axis, on their own
+            turned_rad = 1e-9 * _FRAME_NS * (row - 80) * 0.04
+            x, y = (first_px - [160.0, 120.0]).T
+            frame.uv_px = first_px + turned_rad * np.column_stack([-y, x])
+            frame.uv_px += rng.normal(0.0, noise_px, frame.uv_px.shape)
+            frame.camera, frame.track_id = frame.camera[:24], frame.track_id[:24]
+        frame.time_ns = row * _FRAME_NS
+        watch.usable(_interval(row, samples), window)
+        watch.compare(frame, _interval(row, samples), window)
+    assert [failure.sensor for failure in watch.failures] == (["gyroscope"] if not noise_px else [])
+
+
 @pytest.mark.parametrize("is_known", [True, False])
 def test_a_rolling_shutter_that_is_known_contradicts_no_sample(*, is_known: bool) -> None:
     rolling = dataclasses.replace(_CAMERA, line_delay_ns=60_000, image_delay_s=-0.0072)
     rng, watch, frame = np.random.default_rng(5), _watch(), _frame()
+    largest = 0.0
     window = _window(camera=rolling if is_known else _CAMERA)
     p_M = window.landmarks()[1]
 
@@ -218,7 +237,10 @@ def test_a_rolling_shutter_that_is_known_contradicts_no_sample(*, is_known: bool
         window.states.T_M_I[-1, :4] = turn(time_s)
         watch.usable(_interval(row, samples), window)
         watch.compare(frame, _interval(row, samples), window)
-    assert bool(watch.failures) != is_known
+        compared = watch._comparison.compared(frozenset([0]))
+        largest = largest if compared is None else max(largest, np.linalg.norm(compared.rate))
+    assert (largest > 0.03) != is_known
+    assert not watch.failures  # the points scatter, too, where it is not known
 
 
 def test_a_gyroscope_with_another_bias_comes_back_and_stays() -> None:
