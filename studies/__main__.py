@@ -4,18 +4,18 @@ python -m studies measure --scenario=ar_room --sets=15 --out=ar_room.jsonl
 python -m studies odometry --results=ar_room.jsonl --out=ar_room_vio.jsonl
 python -m studies predict --scenario=ar_room --sets=3 --out=ar_room_predicted.jsonl
 python -m studies consistency --sets=50 --swaps=0.03 --out=swaps.jsonl
-python -m studies page --results=ar_room.jsonl --consistency=swaps.jsonl --docs=results
 python -m studies picture --out=docs/images/segment_information.svg
 python -m studies figures --sets=3 --out=docs/images/self_calibration_figures.svg
 python -m studies borders --sets=4 --out=borders.jsonl
 python -m studies joint_ekf --map=FOLDER --out=FOLDER
 python -m studies tables --sets=3 --out=tables.jsonl
+python -m studies page --results=tables.jsonl --out=docs/studies/self_calibration_tables.md
 
-The first four studies append one line per data set and method to a file; a study that was interrupted
-continues. All data sets are recorded with the same device in the same room; motion, noise and appearance
-differ. `page` writes self_calibration_results.md and images/ into a folder; `picture` draws a session,
-coloured by information, `figures` counterparts of those of the thesis. `joint_ekf` calibrates the device
-of a map by a Kalman filter of motion and calibration, and saves the map with the result.
+The first four studies and `tables` append one line per data set and method to a file; a study that was
+interrupted continues. All data sets are recorded with the same device; motion, noise and appearance differ.
+`picture` draws a session, coloured by information, `figures` counterparts of those of the thesis, and `page`
+writes those of its tables. `joint_ekf` calibrates the device of a map by a Kalman filter of motion and
+calibration, and saves the map with the result.
 """
 
 import argparse
@@ -55,11 +55,7 @@ def main(words: Sequence[str] | None = None) -> int:
     """
     given = _parser().parse_args(words)
     if given.study == "page":
-        results, consistency = (
-            [Path(name) for name in names.split(",") if name]
-            for names in (given.results, given.consistency)
-        )
-        results_page.write_page(results, consistency, given.notes, given.docs)
+        results_page.write_page(given.results, given.out)
         return 0
     if given.study == "joint_ekf":
         _calibrate_by_filter(given.map, given.out)
@@ -153,10 +149,8 @@ def _parser() -> argparse.ArgumentParser:
     baseline.add_argument("--map", type=Path, required=True)
     baseline.add_argument("--out", type=Path, required=True)
     page = studies.add_parser("page")
-    page.add_argument("--results", default="", help="files, separated by commas")
-    page.add_argument("--consistency", default="", help="files, separated by commas")
-    page.add_argument("--notes", type=Path, help="text for the end of the page")
-    page.add_argument("--docs", type=Path, default=Path("results"), help="folder of the page")
+    page.add_argument("--results", type=Path, required=True)
+    page.add_argument("--out", type=Path, required=True)
     return parser
 
 

@@ -34,6 +34,7 @@ from studies.data_sets import (
     problem_of,
     true_problem,
 )
+from studies.published import relative_rms
 from studies.selections import FEW, chosen_segments
 
 
@@ -115,6 +116,7 @@ def measure(
             append_line(out, row)
             sys.stdout.write(
                 f"{number:3d} {method:26s} NEES {row['nees']:8.1f}  "
+                f"error {relative_rms(row['error'], row['names']):5.2f} of table 6.1's  "
                 f"map error {row['map_m'] or float('nan'):.4f} m\n"
             )
             sys.stdout.flush()
@@ -214,3 +216,6 @@ def consistency(scenario: Scenario, seeds: range, out: Path) -> None:
         row = _compare(result, report, true_problem(data).states.blocks)
         swaps = scenario.measurement.identity_swap_share
         append_line(out, {"set": seed, "swaps": swaps, **row})
+    rows = lines_of(out)
+    mean = np.mean([row["nees"] for row in rows])
+    sys.stdout.write(f"NEES {mean:.1f} of {len(rows[0]['error'])}, {len(rows)} seeds\n")

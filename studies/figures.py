@@ -19,7 +19,7 @@ from maplab_py.vimap import VIMap
 from studies.accuracy import DataSet
 from studies.data_sets import OPTIONS, data_set
 from studies.joint_ekf import filter_jointly
-from studies.results_page import levels, relative_rms
+from studies.published import levels, relative_rms
 from studies.selections import FEW, WHOLE, rankings
 
 _COUNTS = (1, 2, 4, 6, 8, 12, 16)

@@ -18,7 +18,7 @@ from maplab_py.simulation.scenario import Scenario
 from maplab_py.simulation.truth import true_map
 from maplab_py.vimap import VIMap
 from studies.data_sets import OPTIONS, append_line, data_set, lines_of, problem_of
-from studies.results_page import levels
+from studies.published import levels
 from studies.selections import FEW, WHOLE, joint_designs, random_choice, rankings
 
 

@@ -15,7 +15,7 @@ from maplab_py.array_types import F64, I64
 from maplab_py.simulation.scenario import Scenario
 from maplab_py.vimap import VIMap
 from studies.data_sets import OPTIONS, append_line, data_set
-from studies.results_page import levels, relative_rms
+from studies.published import levels, relative_rms
 from studies.selections import FEW
 
 _PIECE = 11

@@ -12,13 +12,27 @@ import pytest
 from maplab_py.algorithms.self_calibration.segments.selection import Evaluation, evaluate
 from maplab_py.simulation.scenario import MotionOptions, Scenario, SessionOptions
 from maplab_py.simulation.scenario_file import load_scenario
-from studies import accuracy, figures, odometry, predicted_deviations
+from studies import accuracy, figures, odometry, predicted_deviations, thesis_tables
 from studies.__main__ import main
-from studies.data_sets import lines_of
+from studies.data_sets import Row, lines_of
+from studies.published import TABLE_72
 from studies.selections import METHODS, chosen_segments, joint_designs, rankings
+from studies.thesis_tables import FILTER, OFFICE_ROOM, PAPER_III_METHODS
+from studies.thesis_tables import METHODS as METHODS_OF_TABLES
 from tests.algorithms.self_calibration.scenes import OPTIONS, scene_map
 
-NAMES = ["gyroscope x scale", "accelerometer z scale", "camera centre u", "camera position x"]
+NAMES = [
+    "gyroscope x scale",
+    "gyroscope xy misalignment",
+    "accelerometer z scale",
+    "accelerometer yz misalignment",
+    "accelerometer rotation about x",
+    "camera focal length u",
+    "camera centre u",
+    "camera distortion w",
+    "camera position x",
+    "camera rotation about z",
+]
 
 
 @cache
@@ -77,26 +91,29 @@ def test_joint_designs_are_no_worse_than_single_scores_at_what_they_minimise() -
 
 
 def test_the_page_shows_what_was_measured(tmp_path: Path) -> None:
-    (tmp_path / "images").mkdir()
-    rows = [{"set": -1, "method": "truth", "map_m": 0.01}]
-    for number in range(3):
-        for method, error in (("8: A-optimality", 1e-3), ("8: random", 2e-3)):
-            row = {"set": number, "method": method, "names": NAMES, "error": [error] * 4}
-            row |= {"nees": 4.0, "segments": 8, "cpu_s": 1.0, "map_m": 20.0 * error}
-            rows.append({**row, "selection_s_per_segment": 0.05})
-    results = tmp_path / "room.jsonl"
+    results, page = tmp_path / "tables.jsonl", tmp_path / "page.md"
+    session = {"method": "session", "length_m": 30.0, "duration_s": 120.0, "angular_degps": 20.0}
+    rows = []
+    for environment in TABLE_72:
+        for number in range(3):
+            where = {"environment": environment, "set": number}
+            rows.append({**where, **session})
+            for method in ("nominal", *METHODS_OF_TABLES, *PAPER_III_METHODS):
+                lost = 2.0 if (method, number) == (FILTER, 0) else 0.02
+                row: Row = {"method": method, "names": NAMES, "error": [1e-3 * number] * len(NAMES)}
+                row |= {"segments": 8, "of_segments": 30, "cpu_s": 2.0, "choice_s": 3.0}
+                row |= {"selection_s_per_segment": 0.05, "images": 1000, "vio_m": [0.01, lost]}
+                rows.append({**where, **row})
     results.write_text("".join(json.dumps(row) + "\n" for row in rows))
-    notes = tmp_path / "notes.md"
-    notes.write_text("A note.")
-    words = ["page", f"--results={results}", f"--notes={notes}", f"--docs={tmp_path}"]
-    assert main(words) == 0
-    page = (tmp_path / "self_calibration_results.md").read_text()
-    assert "| 8: random | 3 | 8 | 1.0 | 4 |" in page
-    assert (
-        "| error of the parameters, 8 informative over random |  | 0.50; worse in 100% of" in page
-    )
-    assert page.endswith("A note.\n")
-    assert (tmp_path / "images" / "self_calibration_room.svg").read_text().count("<circle") == 6
+    assert main(["page", f"--results={results}", f"--out={page}"]) == 0
+    text = page.read_text()
+    assert "; 3 sessions of each environment" in text
+    assert "|AR/VR: office room|30 (24)|120 (117)|0.25 (0.2)|20 (20)|" in text
+    assert "|1.50 (1.5)|" in text
+    assert "|1.50, 1 diverged (1.86)|" in text
+    assert "|camera position [mm]|1 (2.7)|1 (1.2)|1 (2.9)|" in text
+    assert "|run time [s]|3.5 (31)|5 (396)|2 (178)|" in text
+    assert "|odometry, an image|||0.002 (0.003)|" in text
 
 
 @pytest.mark.slow
@@ -116,12 +133,17 @@ def test_a_study_from_the_simulation_to_the_page(tmp_path: Path) -> None:
         r["selection"]: np.array(r["sigma"]) for r in lines_of(tmp_path / "short_predicted.jsonl")
     }
     assert np.all(sigma["batch"] <= sigma["8: random"] * (1.0 + 1e-9))
-    (tmp_path / "images").mkdir()
-    assert main(["page", f"--results={out}", f"--docs={tmp_path}"]) == 0
-    assert (
-        "Deviations that a selection can reach"
-        in (tmp_path / "self_calibration_results.md").read_text()
-    )
+
+
+@pytest.mark.slow
+def test_tables_are_measured_in_every_environment(tmp_path: Path) -> None:
+    out = tmp_path / "tables.jsonl"
+    for _ in range(2):  # the second time everything is there
+        thesis_tables.measure({OFFICE_ROOM: short_scenario()}, range(1), out)
+    rows = {row["method"]: row for row in lines_of(out)}
+    assert [*rows] == ["session", "nominal", *METHODS_OF_TABLES, *PAPER_III_METHODS]
+    assert max(rows["batch"]["vio_m"]) < 0.5 * min(rows["nominal"]["vio_m"])
+    assert rows["session"]["duration_s"] == pytest.approx(14.0, abs=0.2)
 
 
 @pytest.mark.slow
