@@ -1,15 +1,30 @@
 """Commands that measure the accuracy of a map."""
 
+from __future__ import annotations
+
 import dataclasses
 import weakref
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from maplab_py.algorithms.evaluation import reports
 from maplab_py.algorithms.evaluation.options import TrajectoryEvaluationOptions
 from maplab_py.algorithms.map_update.options import ChangeReport
 from maplab_py.console.session.session import MEASURED
-from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, UserError, command
-from maplab_py.vimap import VIMap
+from maplab_py.plugin import (
+    ALL_MISSIONS,
+    CommandContext,
+    MissionChoice,
+    UserError,
+    check_writable,
+    command,
+)
+
+if TYPE_CHECKING:
+    from maplab_py.algorithms.dense.grid import Mesh
+    from maplab_py.vimap import VIMap
+
+_CHANGED = "appeared", "vanished"
 
 
 @command(
@@ -76,9 +91,15 @@ def evaluate_trajectory(
     "compare_maps",
     example="compare_maps before_optvi",
     see_also=("import_colmap", "evaluate_trajectory"),
+    writes_files=True,
 )
 def compare_maps(
-    context: CommandContext, other_map: str, *, changes: bool = False
+    context: CommandContext,
+    other_map: str,
+    *,
+    changes: bool = False,
+    change_meshes: Path | None = None,
+    overwrite: bool = False,
 ) -> reports.MapComparisonReport | ChangeReport:
     """Show how the selected map and another one differ; rows are matched by their ids.
 
@@ -88,15 +109,54 @@ def compare_maps(
         other_map: Key of a map in memory, or folder of a map.
         changes: Place the other map in the selected one as a later session, and list the regions that
             vanished, appeared or moved.
+        change_meshes: Folder that gets appeared.ply and vanished.ply, the surfaces in space that was free
+            or is free now (with --changes). Both maps need grids (`tsdf`) and distance fields (`esdf`).
+        overwrite: Replace files that exist.
     """
     other = map_of_key_or_folder(context, other_map)
+    files = [change_meshes / f"{kind}.ply" for kind in _CHANGED] if change_meshes else []
+    for file in files:
+        check_writable(file, overwrite=overwrite)
+    if files and not changes:
+        raise UserError("--change_meshes wants --changes")
     if changes:
         from maplab_py.algorithms.map_update.update import changes_since
+        from maplab_py.interop.mesh_files import write_mesh
 
-        return changes_since(context.vi_map, other, progress=context.progress)[1]
+        whole, report = changes_since(context.vi_map, other, progress=context.progress)
+        meshes = changed_meshes(context, whole, other, other_map) if files else ()
+        if files and not meshes:
+            raise UserError(
+                "--change_meshes wants grids and distance fields of both maps: tsdf and esdf make them"
+            )
+        for file, mesh in zip(files, meshes, strict=True):
+            write_mesh(mesh.p, mesh.faces, file, overwrite=overwrite)
+        return report
     from maplab_py.algorithms.evaluation import map_comparison
 
     return map_comparison.compare_maps(context.vi_map, other)
+
+
+def changed_meshes(
+    context: CommandContext, whole: VIMap, session: VIMap, name: str
+) -> tuple[Mesh, ...]:
+    """Return the surfaces that appeared and vanished; none where a map has no voxels.
+
+    Args:
+        context: The earlier map is selected.
+        whole: Both maps as one.
+        session: The later one.
+        name: Its key or folder.
+    """
+    from maplab_py.algorithms.dense.changes import changed_surfaces, has_voxels
+    from maplab_py.algorithms.map_update.update import at_places_of
+
+    vi_map = context.vi_map
+    if not (has_voxels(vi_map) and has_voxels(session)):
+        return ()
+    folder = context.maps.get(name).folder if name in context.maps else Path(name)
+    later = at_places_of(whole, session), folder or Path()
+    return changed_surfaces((vi_map, context.map_folder or Path()), later)
 
 
 def map_of_key_or_folder(context: CommandContext, name: str) -> VIMap:

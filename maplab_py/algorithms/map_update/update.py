@@ -237,6 +237,13 @@ def changes_since(
     return whole, report
 
 
+def at_places_of(whole: VIMap, session: VIMap) -> VIMap:
+    """Return a session with the base frames that its missions, the last of a map, have there."""
+    T_G_M = session.baseframes.T_G_M.copy()
+    T_G_M[session.missions.baseframe] = whole.T_G_M[-len(session.missions) :]
+    return session.replace(baseframes=session.baseframes.replace(T_G_M=T_G_M))
+
+
 def _with_names(report: ChangeReport, name: dict[str, str]) -> ChangeReport:
     """Return the report with other names (ids) of vertices, as far as they have any."""
     renamed = (

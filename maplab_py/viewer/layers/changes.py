@@ -5,10 +5,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from maplab_py.algorithms.dense.grid import Mesh
 from maplab_py.algorithms.map_update.options import Change
 from maplab_py.array_types import U8, U64
 from maplab_py.viewer import colours
 from maplab_py.viewer.drawing import Drawing, ImageOf, make_points, make_segments
+from maplab_py.viewer.layers.clouds import Cloud
 from maplab_py.viewer.scene import WHOLE_MAP, Entity, Layer, Part
 from maplab_py.vimap import VIMap, from_hex
 
@@ -50,6 +52,19 @@ def change_layers(drawing: Drawing, changes: Sequence[Change]) -> list[Layer]:
         Layer("changes", "Changes", lines_of, len(changes)),
         Layer("change_names", "Dates of changes", names, len(named), Entity.VERTEX),
     ]
+
+
+def mesh_clouds(meshes: Sequence[Mesh]) -> tuple[Cloud, ...]:
+    """Return the surfaces that appeared and vanished as meshes to draw; those that are empty are left out."""
+    names = ("appeared", "vanished")[: len(meshes)]
+    return tuple(
+        Cloud(
+            f"Surfaces that {name}", mesh.p, np.tile(colours.from_hex(_COLOURS[name]), (len(mesh.p), 1)),
+            faces=mesh.faces,
+        )
+        for name, mesh in zip(names, meshes, strict=True)
+        if len(mesh.faces)
+    )  # fmt: skip
 
 
 class ChangeImages:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from maplab_plugins.evaluation import map_of_key_or_folder
+from maplab_plugins.evaluation import changed_meshes, map_of_key_or_folder
 from maplab_plugins.visualization.following import ViewerOptions, ViewReport, images_of, show
 from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, Report, UserError, command
 from maplab_py.report import counted
@@ -209,7 +209,7 @@ def visualize_changes(
     options: VisualizationOptions = VisualizationOptions(),
     display: ViewerOptions = ViewerOptions(),
 ) -> ViewReport:
-    """Show what `compare_maps --changes` finds as boxes with dates.
+    """Show what `compare_maps --changes` finds as boxes with dates, of dense maps also the surfaces.
 
     A click on a date shows the images before and after the change side by side.
 
@@ -218,10 +218,10 @@ def visualize_changes(
     """
     from maplab_py.algorithms.map_update.update import changes_since
     from maplab_py.viewer.building import Subject
-    from maplab_py.viewer.layers.changes import ChangeImages
+    from maplab_py.viewer.layers.changes import ChangeImages, mesh_clouds
 
     other = map_of_key_or_folder(context, session)
-    _, report = changes_since(context.vi_map, other, progress=context.progress)
+    whole, report = changes_since(context.vi_map, other, progress=context.progress)
     folder = context.maps.get(session).folder if session in context.maps else Path(session)
     images = ChangeImages(
         (context.vi_map, images_of(context.vi_map, context.map_folder)),
@@ -230,7 +230,10 @@ def visualize_changes(
     )
     count = counted(len(report.changes), "change")
     note = f"{count} from {report.earlier} to {report.later}; {report.note}".rstrip("; ")
-    subject = Subject(context.vi_map, context.map_key, options, changes=report.changes, note=note)
+    subject = Subject(
+        context.vi_map, context.map_key, options, changes=report.changes, note=note,
+        clouds=mesh_clouds(changed_meshes(context, whole, other, session)),
+    )  # fmt: skip
     return show(context, subject, display, image_of=images)
 
 
