@@ -186,7 +186,7 @@ def task_on(
     lines: list[str] = []
     for line in stage.commands:
         repeated = inputs if MAP_TEMPLATE in line else inputs[:1]
-        lines += [line.replace(MAP_TEMPLATE, _word(folder)) for folder in repeated]
+        lines += [line.replace(MAP_TEMPLATE, shlex.quote(str(folder))) for folder in repeated]
     result = inputs[0] if edits_input else results / stage.name / name
     return Task(
         stage.name,
@@ -211,8 +211,3 @@ def names_of(folders: Sequence[Path]) -> list[str]:
         if len(set(names)) == len(names):
             return names
     raise UserError("a map folder is given twice")
-
-
-def _word(folder: Path) -> str:
-    """Return a folder as a word of a line, whatever its name holds."""
-    return shlex.quote(str(folder))

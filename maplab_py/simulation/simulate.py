@@ -5,7 +5,7 @@ from typing import Self
 
 import numpy as np
 
-from maplab_py.array_types import F32, F64
+from maplab_py.array_types import F64
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.ply import PlyCloud, encode_ply
@@ -205,11 +205,7 @@ class Lidar:
         z = range_m / length
         p_column = np.stack([np.zeros_like(z), z * self.slope, z], axis=2)
         p_L = se3.transform(self.T_L_column[:, None], p_column)
-        return PlyCloud(p_L[seen], intensity=_as_intensity(grey[seen]))
-
-
-def _as_intensity(grey: F32) -> F64:
-    return np.asarray(np.round(grey, 1), dtype=np.float64)
+        return PlyCloud(p_L[seen], intensity=np.asarray(np.round(grey[seen], 1), dtype=np.float64))
 
 
 def with_lidar_clouds(

@@ -92,7 +92,7 @@ def anchor_missions(
         yaw.from_pose(vi_map.T_G_M),
         known,
         _sightings(judged, detection),
-        _undecided(detection),
+        {c.pair.missions: c.reason for c in detection.contests if c.winner < 0},
         options,
         names,
     )
@@ -179,11 +179,6 @@ def _describe(pair: Pair, names: list[str]) -> MissionAlignment:
         rms_m=pair.rms_m,
         verdict=pair.verdict,
     )
-
-
-def _undecided(detection: Detection) -> dict[tuple[int, int], str]:
-    """Return the pairs of missions that have alignments of which none wins, with the reason."""
-    return {c.pair.missions: c.reason for c in detection.contests if c.winner < 0}
 
 
 def _sightings(vi_map: VIMap, detection: Detection) -> Sightings:

@@ -86,13 +86,8 @@ def prepare_cloud(p_S: F64, voxel_size_m: float, name: str) -> PreparedCloud:
             f"{name} has {len(points)} points after thinning, registration needs {_MIN_POINTS}: choose "
             "a smaller --lidar_lc_voxel_size_m"
         )
-    normals = _normals(np.array(fine.covs())[:, :3, :3])
+    normals = np.asarray(np.linalg.eigh(np.array(fine.covs())[:, :3, :3])[1][:, :, 0])
     return PreparedCloud(fine, tree, coarse, coarse_tree, points, normals)
-
-
-def _normals(covariance: F64) -> F64:
-    """Return the directions (N, 3) of the smallest eigenvalues of covariances (N, 3, 3)."""
-    return np.asarray(np.linalg.eigh(covariance)[1][:, :, 0])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -137,7 +137,9 @@ def make_report(
         iterations=summary.iterations,
         rejected_steps=summary.rejected_steps,
         termination=summary.termination,
-        recent_decrease_percent=_percent_of_start(summary.recent_decrease, _cost(terms)),
+        recent_decrease_percent=(
+            100.0 * summary.recent_decrease / max(_cost(terms) + summary.recent_decrease, 1e-300)
+        ),
         vertices=len(selection.vertices),
         vertices_held=len(map_problem.held),
         landmarks=landmarks,
@@ -240,8 +242,3 @@ def _chi_square_per_freedom(map_problem: MapProblem, states: States, errors_px: 
     ):
         free += 3 * int(np.count_nonzero(map_problem.rejection.used_landmarks()))
     return total / (count - free) if count > free else float("nan")
-
-
-def _percent_of_start(decrease: float, cost: float) -> float:
-    """Return a decrease that led to a cost in percent of the cost before it."""
-    return 100.0 * decrease / max(cost + decrease, 1e-300)

@@ -31,11 +31,6 @@ class MissionPoses:
     frames: tuple[str, str, str]  # G, M, I
     suffix: str  # of topics
 
-    @property
-    def T_G_Ms(self) -> F64:
-        """The pose of the mission, once for each time (N, 7)."""
-        return np.broadcast_to(self.T_G_M, self.T_M_I.shape)
-
 
 def add_poses_to_bag(
     vi_map: VIMap,
@@ -143,7 +138,7 @@ def _added(
 ) -> list[Iterator[bag_writing.BagMessage]]:
     """Return the streams of messages of a mission; topics that the bag has go on in their channel."""
     world, odom, base = poses.frames
-    T_G_M, T_M_I = poses.T_G_Ms, poses.T_M_I
+    T_G_M, T_M_I = np.broadcast_to(poses.T_G_M, poses.T_M_I.shape), poses.T_M_I
     streams: list[tuple[str, str, list[bytes]]] = []
     if options.add_transform_stamped:
         for name, T, frames in (
