@@ -331,7 +331,7 @@ def acceptance(
         moved = dataclasses.replace(options, **{n: kinds[n](v) for n, v in changes.items()})
         judged, _ = judge(vi_map, query, place, T_M_I, measured, moved)
         decided = VERDICTS[judged.verdict[row]]
-        others = int(np.count_nonzero(judged.accepted & ~before)) - int(judged.accepted[row])
+        others = int(np.count_nonzero(np.delete(judged.accepted & ~before, row)))
         failed = [gate for gate in closure_gates(judged, moved) if gate.failed[row]]
     flags = tuple(f"--lc_{name}={getattr(moved, name):g}" for name in changes)
     return Acceptance(flags, decided, others) if flags else None

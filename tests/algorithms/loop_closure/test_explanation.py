@@ -275,6 +275,18 @@ def test_a_contradicted_closure_names_the_difference_at_which_it_agrees() -> Non
     assert "would pass" in explain_closure(vi_map, row, moved_options).summary
 
 
+def test_a_closure_that_passes_since_the_map_was_relaxed_is_none_of_the_others() -> None:
+    vi_map = closed_loops([Walk(room=1), Walk(room=1, mission=1, start_s=60.0, drift=DRIFT)])
+    closures = read_record(vi_map).closures
+    row = len(closures) // 2
+    verdict, difference = closures.verdict.copy(), closures.difference.copy()
+    verdict[row], difference[row] = VERDICTS.index(Verdict.CONTRADICTED), 1.5  # as it once was
+    closures = closures.replace(verdict=verdict, difference=difference)
+    found = acceptance(vi_map, closures, row, OPTIONS)
+    assert found is not None
+    assert (found.verdict, found.others) == (Verdict.ACCEPTED, 0)
+
+
 def test_pairs_and_missions(strict: VIMap) -> None:
     options = dataclasses.replace(OPTIONS, min_inlier_count=1000)
     unknown = np.zeros(len(strict.baseframes), dtype=np.bool_)
