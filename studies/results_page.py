@@ -24,17 +24,18 @@ _ANSWER = (
 )
 _LIMITS = "So few tell a deviation to a half. Run times are of another processor."
 _SHOWS = {
-    "6.1": "Informative segments vary as little as all data (thesis: twice as much). Information gain stops "
-    "at the first eight\nabove its threshold, and is far worse here.",
+    "6.1": "Informative segments vary hardly more than all data (thesis: twice as much). Information gain "
+    "stops at the first eight\nabove its threshold, and is far worse here.",
     "6.2": "Groups gain nothing here, although they keep 11 segments for 8.",
-    "6.3": "Information gain takes three times as long as scores of single segments (thesis: 13 times).",
+    "6.3": "Information gain takes nearly four times as long as scores of single segments "
+    "(thesis: 13 times).",
     "7.1": "The same as in the thesis, by number of dimensions:",
     "7.2": "Our office building is straight corridors with few turns, in which selection matters most.",
     "7.3": "Selected segments do as well as all data by every criterion, as in the thesis; random ones are "
-    "worse, most where little\nof a session excites. The filter diverges in three of four sessions that "
-    "begin at rest.",
+    "worse, most where little\nof a session excites. The filter diverges in four of nine sessions, which "
+    "begin at rest or on the spot.",
     "7.4": "Eight segments vary hardly more than all data (thesis: 2 to 40 times).",
-    "7.5": "Calibrating on eight segments takes 0.15 of the time of all data (thesis: 0.45).",
+    "7.5": "Calibrating on eight segments takes a quarter of the time of all data (thesis: 0.45).",
 }
 """Sentence on every table."""
 DIVERGED_M = 1.0
