@@ -109,8 +109,8 @@ def compare_maps(
         other_map: Key of a map in memory, or folder of a map.
         changes: Place the other map in the selected one as a later session, and list the regions that
             vanished, appeared or moved.
-        change_meshes: Folder that gets appeared.ply and vanished.ply, the surfaces in space that was free
-            or is free now (with --changes). Both maps need grids (`tsdf`) and distance fields (`esdf`).
+        change_meshes: Folder that gets appeared.ply and vanished.ply, the surfaces where space was free or
+            is free now (with --changes; both maps need `tsdf` and `esdf`).
         overwrite: Replace files that exist.
     """
     other = map_of_key_or_folder(context, other_map)

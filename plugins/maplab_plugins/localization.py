@@ -62,7 +62,7 @@ def localize(
 ) -> LocalizationReport:
     """Localise the images of the selected map in another map, one by one.
 
-    No map is changed, but for the evidence of --gather_evidence.
+    Only --gather_evidence changes a map.
 
     Descriptors of one feature type are matched, in a summary map those that it was made from, else
     those of --lc_feature_type; keypoints with others are left out.
