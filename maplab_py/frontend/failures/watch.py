@@ -236,6 +236,8 @@ class SensorWatch:
         states, cameras_now = smoother.states, smoother.cameras
         v_I = so3.rotate(so3.inverse(states.T_M_I[-1, :4]), states.motion[-1, :3])
         rate_I = interval.accel_gyro[-1, 3:] - states.motion[-1, 3:6]
+        if ImuPart.GYROSCOPE in self.failed:
+            rate_I, _ = _constant_velocity(smoother, self._imu)
         late_s = smoother.calibration.lateness_s(
             frame.camera, frame.uv_px, frame.delay_s, cameras_now
         )
