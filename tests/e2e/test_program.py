@@ -76,6 +76,16 @@ def test_a_state_folder_that_cannot_be_written_is_no_obstacle(tmp_path: Path) ->
     assert "no log file" in done.stderr
 
 
+def test_a_full_disk_of_the_state_folder_is_no_obstacle(tmp_path: Path) -> None:
+    done = subprocess.run(
+        ["sh", "-c", 'ulimit -f 0; exec "$@"', "sh", *PROGRAM, "-c", "create_new_map a; list"],
+        capture_output=True, text=True, cwd=tmp_path, env=environment(tmp_path), check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("warning: no more log") == 1
+    assert "Traceback" not in done.stderr
+
+
 def test_interrupt_ends_a_repetition_and_the_script_goes_on(tmp_path: Path) -> None:
     child = subprocess.Popen(
         [*PROGRAM, "-c", "create_new_map a; watch 'list' --every=30; list"],

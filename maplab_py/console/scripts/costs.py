@@ -11,10 +11,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from maplab_py.atomic import write_file
 from maplab_py.console.session.call import Call
 from maplab_py.console.session.maps import MapManager
-from maplab_py.console.session.paths import state_folder
+from maplab_py.console.session.paths import state_folder, write_state
 from maplab_py.console.session.session import Session
 from maplab_py.memory import resident_bytes
 from maplab_py.report import Report
@@ -82,10 +81,8 @@ def measuring(call: Call, session: Session) -> Iterator[None]:
     written_mb = sum(_disk_mb(path) for path in {*_paths(call, is_read=False), *saved})
     cost = Cost(before_mb, seconds, grown_mb, _map_mb(session.maps), written_mb)
     costs[call.command.name] = [*costs.get(call.command.name, []), cost][-_MOST_RUNS:]
-    with suppress(OSError):  # the prediction is a convenience
-        content = {name: [dataclasses.astuple(run) for run in runs] for name, runs in costs.items()}
-        state_folder().mkdir(parents=True, exist_ok=True)
-        write_file(state_folder() / _FILE, [json.dumps(content).encode()])
+    content = {name: [dataclasses.astuple(run) for run in runs] for name, runs in costs.items()}
+    write_state(_FILE, json.dumps(content))
 
 
 def read_costs() -> dict[str, list[Cost]]:

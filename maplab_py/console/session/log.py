@@ -37,8 +37,18 @@ def start_logging() -> None:
 def _file_handler(path: Path) -> logging.Handler:
     from logging.handlers import RotatingFileHandler
 
+    class Handler(RotatingFileHandler):
+        """Warns once if the file cannot be written any more: a full disk ends no command."""
+
+        has_warned = False
+
+        def handleError(self, _: logging.LogRecord) -> None:
+            if not self.has_warned:
+                self.has_warned = True
+                write_message(sys.stderr, f"warning: no more log: {sys.exc_info()[1]}")
+
     path.parent.mkdir(parents=True, exist_ok=True)
-    handler = RotatingFileHandler(
+    handler = Handler(
         path, maxBytes=_MAX_BYTES, backupCount=_KEPT_FILES, encoding="utf-8", delay=True
     )
     handler.setFormatter(logging.Formatter(_FORMAT))

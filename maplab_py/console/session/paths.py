@@ -6,9 +6,10 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from maplab_py.atomic import write_file
+from maplab_py.errors import UserError
 
 _METADATA = Path("vi_map") / "vi_map_metadata"
-_MOST_RECENT = 20
+_RECENT, _MOST_RECENT = "recent_maps", 20
 
 
 def state_folder() -> Path:
@@ -31,22 +32,23 @@ def user_aliases() -> Path:
 def recent_maps() -> list[Path]:
     """Return the folders of maps that were loaded or saved last and are still there, latest first."""
     try:
-        lines = _recent_file().read_text(errors="replace").splitlines()
+        lines = (state_folder() / _RECENT).read_text(errors="replace").splitlines()
     except OSError:
         return []
     return [Path(line) for line in lines if (Path(line) / _METADATA).is_file()]
 
 
 def remember_maps(folders: Iterable[Path]) -> None:
-    """Put the folders of maps in front of the recent ones; not where the state folder cannot be written."""
+    """Put the folders of maps in front of the recent ones."""
     recent = dict.fromkeys(
         [*(str(folder.resolve()) for folder in folders), *map(str, recent_maps())]
     )
     lines = [path for path in recent if path.isprintable()][:_MOST_RECENT]
-    with contextlib.suppress(OSError):
+    write_state(_RECENT, "".join(f"{line}\n" for line in lines))
+
+
+def write_state(name: str, text: str) -> None:
+    """Write a file of the state folder if it can be written: what it holds is a convenience."""
+    with contextlib.suppress(OSError, UserError):
         state_folder().mkdir(parents=True, exist_ok=True)
-        write_file(_recent_file(), ["".join(f"{line}\n" for line in lines).encode()])
-
-
-def _recent_file() -> Path:
-    return state_folder() / "recent_maps"
+        write_file(state_folder() / name, [text.encode()])
