@@ -176,7 +176,8 @@ def test_the_motion_that_a_calibration_lacks_is_asked_for(browser: Any) -> None:
         assert arrows.locator("path[marker-end]").count() == tips
         box, filled = bar.bounding_box(), bar.locator("div").bounding_box()
         assert filled["width"] == pytest.approx(share * box["width"], abs=2.0)
-        assert box["y"] + box["height"] < 844  # on a phone it can be seen without scrolling
+        # on a phone it can be seen without scrolling, as soon as the sheet has slid up
+        assert page.wait_until(lambda: (b := bar.bounding_box())["y"] + b["height"] < 844)
     viewer.motion.show("", 1.0)
     assert page.wait_until(lambda: page.page.get_by_text("known as well as wanted").count() == 1)
     assert page.page.get_by_role("img", name=MOTIONS[4].words).count() == 0
