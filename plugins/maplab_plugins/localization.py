@@ -98,6 +98,8 @@ def localize(
     query = context.vi_map
     missions = chosen.rows(context.vi_map)
     database, searched = _database(context, localization_map, missions, features, size)
+    if evidence.gather_evidence and searched is None:
+        raise UserError(f"--gather_evidence wants a map: {localization_map} is a summary map")
     localizations = localize_missions(
         database,
         query,
@@ -107,7 +109,7 @@ def localize(
         progress=context.progress,
     )
     if evidence.gather_evidence:
-        _add_evidence(context, localization_map, missions, searched)
+        _add_evidence(context, localization_map, missions)
     reference, T_R_G = _reference(query, localizations, database, searched, ground_truth, truth)
     report = describe(
         database, localizations, reference=reference, T_R_G=T_R_G, success_error_m=success_error_m
@@ -121,15 +123,11 @@ def localize(
     return report
 
 
-def _add_evidence(
-    context: CommandContext, name: str, missions: NDArray[np.int64] | None, searched: VIMap | None
-) -> None:
+def _add_evidence(context: CommandContext, name: str, missions: NDArray[np.int64] | None) -> None:
     """Add what the queries saw and missed to the map in which they are localised."""
     from maplab_py.algorithms.map_update.update import gather_all
     from maplab_py.vimap.edits import remove_missions
 
-    if searched is None:
-        raise UserError(f"--gather_evidence wants a map: {name} is a summary map")
     if name:
         is_left_out = np.zeros(len(context.vi_map.missions), dtype=np.bool_)
         if missions is not None:

@@ -112,6 +112,7 @@ def with_contradicted_freed(
     try:
         problem = build(vi_map, free, missions=missions, progress=progress)
     except NotEnoughMemory:
+        progress.line("whether the residuals contradict the calibration is not known: too large")
         return options
     visual = problem.problem.visual
     if visual is None or np.count_nonzero(visual.observations.inverse_sigma) < _MIN_OBSERVATIONS:

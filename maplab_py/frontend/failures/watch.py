@@ -310,10 +310,11 @@ class SensorWatch:
 
     def _judge(self, new: Disagreement, now_ns: int, smoother: FixedLagSmoother) -> None:
         """Leave parts of the IMU out, or take them back."""
+        misfit = self._misfit(new)
         for part in (ImuPart.GYROSCOPE, ImuPart.ACCELEROMETER):
             failure, agrees = self._open.get(_NAMES[part]), False
             if failure is None and new.since_ns >= self._usual[part].from_ns:
-                agrees = self._agrees(part, new, now_ns, smoother)
+                agrees = self._agrees(part, new, misfit, now_ns, smoother)
             elif failure is not None and failure.is_by_motion:
                 self._reconsider(failure, part, new, now_ns)
             if part is ImuPart.GYROSCOPE and not agrees:
@@ -322,11 +323,16 @@ class SensorWatch:
                 return
 
     def _agrees(
-        self, part: ImuPart, new: Disagreement, now_ns: int, smoother: FixedLagSmoother
+        self,
+        part: ImuPart,
+        new: Disagreement,
+        misfit: float,
+        now_ns: int,
+        smoother: FixedLagSmoother,
     ) -> bool:
         """Return whether a part of the IMU agrees with the images; leave it out if not for long."""
         usual, error = self._usual[part], _of(new, part)
-        if usual.add(part, error, _SIGMAS * new.sigma[part] * self._misfit(new)) <= 1.0:
+        if usual.add(part, error, _SIGMAS * new.sigma[part] * misfit) <= 1.0:
             usual.since_ns, usual.bias = new.since_ns, new.biases[part]
             return True
         if usual.in_row >= _IN_ROW:
