@@ -169,14 +169,18 @@ class Registry:
                 self._commands[name] = command
 
     def add_module(self, module: ModuleType, plugin: Plugin) -> None:
-        """Register the commands that a module or package defines (not those it only imports)."""
-        for value in list(vars(module).values()):
+        """Register the commands that a module defines, not those it imports from elsewhere.
+
+        Of a package they are those of its `__init__`, and of the modules that its `__all__` names.
+        """
+        for name, value in list(vars(module).items()):
             command = getattr(value, COMMAND_ATTRIBUTE, None)
-            if not isinstance(command, Command) or isinstance(value, type):
-                continue
-            home = command.function.__module__
-            if home == module.__name__ or home.startswith(module.__name__ + "."):
-                self.add(command, plugin)
+            if isinstance(value, ModuleType) and name in getattr(module, "__all__", ()):
+                self.add_module(value, plugin)
+            elif isinstance(command, Command) and not isinstance(value, type):
+                home = command.function.__module__
+                if home == module.__name__ or home.startswith(module.__name__ + "."):
+                    self.add(command, plugin)
 
     def _provide(self, name: str) -> bool:
         """Load the built-in plugin that declares a name, if any; return whether the name is in use."""
