@@ -6,10 +6,9 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from maplab_py.geometry import se3, so3
-from maplab_py.interop.mvs import MvsScene, bundler_text, encode_model, projection_text
+from maplab_py.interop.mvs import MvsScene, bundler_text, projection_text
 
 READ = """
 import json, sys
@@ -63,30 +62,6 @@ def read_by_colmap(folder: Path) -> dict:
     )
     assert result.returncode == 0, result.stderr
     return json.loads(result.stdout.splitlines()[-1])
-
-
-def test_colmap_reads_the_model(tmp_path: Path) -> None:
-    pytest.importorskip("pycolmap")
-    model = scene()
-    for name, content in encode_model(model).items():
-        (tmp_path / name).write_bytes(content)
-    read = read_by_colmap(tmp_path)
-    assert read["cameras"]["2"] == ["PINHOLE", 320, 200, 250.0, 250.0, 160.5, 99.5]
-    for row, name in enumerate(model.names):
-        matrix, points = read["images"][name]
-        np.testing.assert_allclose(matrix, se3.to_matrix(model.T_C_G[row])[:3], atol=1e-12)
-        of_view = np.flatnonzero(model.view == row)
-        np.testing.assert_allclose([p[:2] for p in points], model.uv_px[of_view] + 0.5)
-        assert [p[2] for p in points] == (model.landmark[of_view] + 1).tolist()
-    for point in range(4):
-        values = read["points"][str(point + 1)]
-        np.testing.assert_allclose(values[:3], model.p_G[point])
-        assert values[3:6] == model.colours[point].tolist()
-        assert values[6] == pytest.approx(model.error_px[point])
-        rows = np.flatnonzero(model.landmark == point)
-        assert sorted(name for name, _ in values[7]) == sorted(
-            model.names[view] for view in model.view[rows]
-        )
 
 
 def test_projections_of_pmvs_and_bundler_agree() -> None:

@@ -48,19 +48,6 @@ def twins() -> tuple[Session, list[str]]:
     return session, [to_hex(words)[:8] for words in vi_map.missions.id]
 
 
-def test_alignments_in_doubt_are_listed_with_their_support() -> None:
-    session, names = twins()
-    report = session.run("aam")
-    assert report.anchored == ()
-    assert [h.number for h in report.hypotheses] == list(range(1, len(report.hypotheses) + 1))
-    mine = [h for h in report.hypotheses if h.missions == f"{names[0]} - {names[2]}"]
-    assert len(mine) == 2
-    assert {h.outcome for h in mine} == {"undecided"}
-    assert min(min(h.stretches) for h in mine) >= 2
-    apart = np.array(mine[0].position_m) - np.array(mine[1].position_m)
-    np.testing.assert_allclose(np.abs(apart), [0.0, 9.0, 0.0], atol=0.1)
-
-
 @pytest.mark.parametrize("y", [0.0, 9.0])
 def test_a_person_decides_by_the_number_of_an_alignment(y: float) -> None:
     session, names = twins()

@@ -144,42 +144,6 @@ def test_colmap_reads_the_workspace(
         room_session.run("export_colmap_mvs", colmap_workspace=workspace)
 
 
-def test_undistorted_images_are_straight_and_poses_are_those_of_the_map(
-    room_session: Session, room: StereoRoom, tmp_path: Path
-) -> None:
-    """Landmarks projected by the matrices of PMVS lie where their keypoints are."""
-    room_session.run("import_images", dataset_folder=room.recording)
-    folder = tmp_path / "pmvs"
-    report: Any = room_session.run(
-        "export_for_pmvs",
-        pmvs_reconstruction_folder=folder,
-        pmvs_undistortion_alpha=1.0,
-        pmvs_export_data_for_nth_vertex=2,
-        cmvs_use_only_good_landmarks=False,
-    )
-    assert report.images == 2 * -(-len(room_session.vi_map.vertices) // 2)
-    images = sorted((folder / "visualize").iterdir())
-    assert len(images) == report.images == len(list((folder / "txt").iterdir()))
-    assert f"timages -1 0 {report.images}" in (folder / "option-all").read_text()
-    lines = (folder / "bundle.rd.out").read_text().splitlines()
-    cameras, points = map(int, lines[1].split())
-    assert (cameras, points) == (report.images, report.points)
-    first = 2 + 5 * cameras
-    error = []
-    height, width = cv2.imread(str(images[0])).shape[:2]
-    for point in range(min(points, 30)):
-        p_G = np.array(lines[first + 3 * point].split(), dtype=float)
-        track = np.array(lines[first + 3 * point + 2].split()[1:], dtype=float).reshape(-1, 4)
-        for view, _, x, y in track:
-            P = np.loadtxt(folder / "txt" / f"{int(view):08d}.txt", skiprows=1)
-            p = P @ np.append(p_G, 1.0)
-            centre = P[:, :3] @ P[2, :3]  # K R r3 = K e3: the principal point
-            error.append(p[:2] / p[2] - centre[:2] - np.array([x, -y]))
-            assert 0.0 <= p[0] / p[2] + 3.0 <= width + 5.0
-            assert 0.0 <= p[1] / p[2] + 3.0 <= height + 5.0
-    assert np.median(np.linalg.norm(error, axis=1)) < 2.0
-
-
 def test_wrong_values_are_refused(room_session: Session, room: StereoRoom, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="import_images"):
         room_session.run("export_colmap_mvs", colmap_workspace=tmp_path / "none")

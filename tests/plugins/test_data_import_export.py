@@ -5,20 +5,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from maplab_plugins import data_import_export
 
 from maplab_py.algorithms.loop_closure.features import map_features
 from maplab_py.algorithms.self_calibration.device import device_of
 from maplab_py.console.session.session import Session
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.interop.trajectories import read_trajectory
-from maplab_py.sensors import Distortion, sensors_yaml, yaml_text
-from maplab_py.vimap import VIMap, ids, merge
+from maplab_py.sensors import Distortion
+from maplab_py.vimap import ids, merge
 from maplab_py.vision.projection import DescriptorProjection, save_projection
 from tests.algorithms.self_calibration.scenes import scene_map
 from tests.interop.recordings.written import make_content, write_folder
 from tests.interop.small_map import RIG_ID, make_map
-from tests.interop.test_calibration_import import CAMCHAIN, IMU, basalt, written
 from tests.simulation.small import simulated
 
 
@@ -29,18 +27,6 @@ def session(tmp_path: Path) -> Session:
     folder.mkdir()
     session.maps.add("small", make_map(), folder=folder)
     return session
-
-
-def test_csv_export(tmp_path: Path, session: Session) -> None:
-    path = tmp_path / "csv"
-    report = session.run("csv_export", csv_export_path=path, csv_export_descriptors=False)
-    assert (report.missions, report.files) == (2, 10)
-    mission = ids.to_hex(session.vi_map.missions.id[1])
-    assert not (path / mission / "descriptors.csv").exists()
-    with pytest.raises(UserError, match="exists already: give --overwrite"):
-        session.run("csv_export", csv_export_path=path)
-    session.run("csv_export", csv_export_path=path, overwrite=True)
-    assert (path / mission / "descriptors.csv").exists()
 
 
 def test_projected_descriptors_are_those_of_loop_closure(tmp_path: Path) -> None:
@@ -86,14 +72,6 @@ def test_wrong_combinations_with_projected_descriptors(tmp_path: Path, session: 
     assert not (tmp_path / "csv").exists()
 
 
-def test_csv_export_vertices_only(tmp_path: Path, session: Session) -> None:
-    path = tmp_path / "csv"
-    mission = ids.to_hex(session.vi_map.missions.id[0])
-    report = session.run("csv_export_vertices_only", csv_export_path=path, map_mission=mission[:6])
-    assert report.vertices == 6
-    assert [file.name for file in path.rglob("*.csv")] == ["vertices.csv"]
-
-
 def test_trajectory_goes_to_the_map_folder_by_default(session: Session) -> None:
     folder = session.maps.selected.folder
     report = session.run("ettc")
@@ -122,41 +100,12 @@ def test_trajectory_options(tmp_path: Path, session: Session) -> None:
         session.run("ettc", csv_export_format="kitti")
 
 
-def test_ncamera_calibration_reads_back(tmp_path: Path, session: Session) -> None:
-    report = session.run("encc", ncamera_calibration_export_folder=tmp_path / "calibration")
-    rig = sensors_yaml.read_sensors(report.files[0]).camera_rig(RIG_ID)
-    expected = session.vi_map.sensors.camera_rig(RIG_ID)
-    assert np.array_equal(rig.cameras[0].intrinsics, expected.cameras[0].intrinsics)
-    assert np.allclose(rig.T_B_C, expected.T_B_C, atol=1e-15)
-    with pytest.raises(UserError, match="exists already"):
-        session.run("encc", ncamera_calibration_export_folder=tmp_path / "calibration")
-    session.maps.add("empty", VIMap())
-    with pytest.raises(UserError, match="no camera rig"):
-        session.run("encc", ncamera_calibration_export_folder=tmp_path / "other")
-
-
-def test_mission_info_lists_every_map(tmp_path: Path, session: Session) -> None:
-    session.maps.add("other", VIMap(), select=False)
-    path = tmp_path / "info.yaml"
-    report = session.run("export_mission_info", mission_info_export_path=path)
-    missions = ids.to_hex_list(session.vi_map.missions.id)
-    assert yaml_text.parse_yaml(path.read_text(), "info") == {"small": missions, "other": []}
-    assert report.rows == 2
-
-
 @pytest.mark.parametrize(
     "command", ["csv_export", "csv_export_vertices_only", "encc", "export_mission_info"]
 )
 def test_a_place_to_write_to_is_needed(session: Session, command: str) -> None:
     with pytest.raises(UserError, match="needs --"):
         session.run(command)
-
-
-def test_help_is_complete() -> None:
-    for name in ("csv_export", "csv_export_vertices_only", "export_trajectory_to_csv"):
-        described = getattr(data_import_export, name).maplab_command
-        assert all(flag.help for flag in described.flags.values())
-        assert "overwrite" in described.flags
 
 
 def test_recording_info(tmp_path: Path) -> None:
@@ -175,22 +124,6 @@ def test_recording_info(tmp_path: Path) -> None:
         )
         with pytest.raises(UserError, match="--imu_topic and --camera_topics apply to bags only"):
             session.run("recording_info", recording=folder, imu_topic="/imu0")
-
-
-def test_a_calibration_is_looked_at_and_written(tmp_path: Path) -> None:
-    with Session() as session:
-        report: Any = session.run("import_calibration", calibration_file=basalt(tmp_path))
-        assert (report.format, len(report.cameras), report.has_imu) == ("Basalt", 2, True)
-        assert "--apply" in report.advice
-        chain, imu = written(tmp_path, "chain.yaml", CAMCHAIN), written(tmp_path, "imu.yaml", IMU)
-        sensors = tmp_path / "sensors.yaml"
-        flags = {"calibration_file": chain, "imu_calibration_file": imu, "sensors_file": sensors}
-        report = session.run("import_calibration", **flags)
-        assert report.cameras[0].time_shift_s == pytest.approx(0.004)
-        assert len(sensors_yaml.read_sensors(sensors).sensors) == 2
-        with pytest.raises(UserError, match=r"sensors\.yaml"):
-            session.run("import_calibration", **flags)
-        session.run("import_calibration", **flags, overwrite=True)
 
 
 def test_a_calibration_is_applied_and_taken_back(tmp_path: Path) -> None:

@@ -16,7 +16,6 @@ import pytest
 from maplab_py.atomic.files import PendingFile
 from maplab_py.console.session.session import Session
 from maplab_py.errors import FlagError, UserError
-from maplab_py.geometry import se3
 from maplab_py.interop.ply import parse_ply
 from maplab_py.storage.native import save_map
 from tests.e2e.support import run_program
@@ -96,21 +95,6 @@ def test_undo_and_failure_leave_nothing_behind(
     session.run("delete_map", yes=True)
     gc.collect()
     assert [path for path in temporary.rglob("*") if path.is_file()] == []
-
-
-def test_a_grid_follows_the_poses(session: Session, tmp_path: Path) -> None:
-    part = {"dense_stereo_debug_reconstruction_end_fraction_of_trajectory": 0.2}
-    session.run("sdr", **part)
-    session.run("tsdf")
-    assert session.run("tsdf", update=True).as_dict()["grids"][0]["added"] == 0
-    vi_map = session.vi_map
-    T_M_I = np.array(vi_map.vertices.T_M_I)
-    T_M_I[2] = se3.retract(T_M_I[2], np.array([0.05, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    entry = session.maps.selected
-    changed = vi_map.replace(vertices=vi_map.vertices.replace(T_M_I=T_M_I))
-    session.maps.update(entry.with_value(changed, "move"))
-    assert session.run("tsdf", update=True).as_dict()["grids"][0]["added"] == 1
-    assert session.run("tsdf", update=True).as_dict()["grids"][0]["added"] == 0
 
 
 def test_distances_for_a_planner(session: Session, room: StereoRoom, tmp_path: Path) -> None:

@@ -24,22 +24,6 @@ def write_truth(path: Path, session: Session) -> Path:
     return path
 
 
-def test_the_command_reports_no_error_for_the_truth(tmp_path: Path, session: Session) -> None:
-    truth = write_truth(tmp_path / "truth.csv", session)
-    report = session.run("evaluate_trajectory", ground_truth=truth)
-    assert (report.matched, report.without_ground_truth) == (12, 0)
-    assert report.ape_m.rmse < 1e-12
-    assert report.as_dict()["ape_m"]["count"] == 12
-    one = session.run(
-        "evaluate_trajectory",
-        ground_truth=truth,
-        alignment="yaw",
-        interpolate=False,
-        map_mission=report.missions[1].mission_id[:8],
-    )
-    assert (one.matched, one.alignment) == (6, "yaw")
-
-
 def test_wrong_requests(tmp_path: Path, session: Session) -> None:
     with pytest.raises(MapError, match=r"cannot read .*absent"):
         session.run("evaluate_trajectory", ground_truth=tmp_path / "absent.csv")

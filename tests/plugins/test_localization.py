@@ -87,28 +87,6 @@ def test_a_file_is_not_overwritten_unasked(session: Session, tmp_path: Path) -> 
     assert table.read_text() == "mine"
 
 
-@pytest.mark.slow
-def test_the_workflow_makes_one_localisation_map_of_two_raw_sessions(tmp_path: Path) -> None:
-    session = Session()
-    session.run("simulate", map_folder=tmp_path / "s", scenario="three_sessions")
-    session.run("load", map_folder=tmp_path / "s" / "session_1", map_key="raw")
-    session.run("load_merge_map", map_folder=tmp_path / "s" / "session_2")
-    report = session.run(
-        "clsm", num_landmarks_to_keep=800, summary_map_save_path=tmp_path / "summary"
-    )
-    assert report.missions == 2
-    assert report.good_landmarks == len(session.vi_map.landmarks) == 800
-    assert session.vi_map.baseframes.is_known.all()
-    assert report.vertices < 0.5 * report.steps[0].vertices
-    session.run("load", map_folder=tmp_path / "s" / "session_3", map_key="query")
-    answer = session.run(
-        "localize", localization_map=report.summary_map, truth=tmp_path / "s" / "truth.npz"
-    )
-    assert answer.success_share > 0.5
-    assert answer.wrong <= 0.02 * answer.queries
-    assert np.isfinite(answer.position_error_m.median)
-
-
 def walk() -> Place:
     """A map and a session of 12 s in it; a single camera may take 4 s to start."""
     return place_of(SessionOptions(duration_s=12.0, turns=0.7, start_turn=0.2, height_m=1.7))
@@ -177,17 +155,6 @@ def test_poses_in_the_map_are_written_and_evaluated(folders: Path, tmp_path: Pat
             )  # fmt: skip
 
 
-@pytest.mark.parametrize("mode", ["swl", "pose", "odo"])
-def test_baselines_run_from_the_console(folders: Path, mode: str) -> None:
-    with Session() as session:
-        report = localized(
-            session, folders, vio_localization_map_folder=folders / "map", localization_mode=mode
-        )
-    assert report.localization is not None
-    assert report.localization.mode == mode
-    assert report.localization.localized_share > 0.5
-
-
 def test_what_a_recording_saw_of_the_map_is_noted_in_it(folders: Path, tmp_path: Path) -> None:
     anchored = walk().vi_map
     known = np.ones(len(anchored.baseframes), dtype=np.bool_)
@@ -204,11 +171,6 @@ def test_what_a_recording_saw_of_the_map_is_noted_in_it(folders: Path, tmp_path:
         assert np.count_nonzero(recent["predicted"]) > 100
         assert 0.5 < (recent["matched"] > 0)[recent["predicted"] > 0].mean() <= 1.0
         assert len(session.vi_map.missions) == len(anchored.missions)
-
-
-def test_without_a_map_nothing_is_said_of_localisation(folders: Path) -> None:
-    with Session() as session:
-        assert localized(session, folders).localization is None
 
 
 def test_wrong_input_is_told_in_one_line(folders: Path, tmp_path: Path) -> None:

@@ -5,15 +5,13 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 from maplab_plugins.visualization.following import Following
 
 from maplab_py.algorithms.cloud_registration import registration
-from maplab_py.algorithms.landmarks.quality import LandmarkExplanation
-from maplab_py.algorithms.loop_closure import closure_record, explanation
+from maplab_py.algorithms.loop_closure import closure_record
 from maplab_py.console.prompt.completion import complete
 from maplab_py.console.session.session import Session
 from maplab_py.console.terminal.render import rendered
@@ -31,15 +29,6 @@ def session_of(walks: list[Walk]) -> Session:
     session = Session()
     session.maps.add("rooms", make_map(walks)[0])
     return session
-
-
-@pytest.mark.parametrize("command", ["lc", "lcom", "loopclosure_all_missions"])
-def test_loops_are_closed_by_merging(command: str) -> None:
-    session = session_of(TWICE)
-    before = len(session.vi_map.landmarks)
-    report = session.run(command)
-    assert report.failure == ""
-    assert len(session.vi_map.landmarks) == before - report.landmarks_merged < before
 
 
 def test_edges_instead_of_merging_and_their_removal() -> None:
@@ -62,12 +51,6 @@ def test_relaxing_brings_the_two_walks_together(command: str) -> None:
     after = np.linalg.norm(session.vi_map.T_G_I[:, 4:] - truth[:, 4:], axis=1).max()
     assert after < 0.4 * before
     assert len(session.vi_map.loop_closure_edges) == 0
-
-
-def test_relaxing_may_merge_too() -> None:
-    session = session_of(TWICE)
-    report = session.run("relax", lc_relax_merge_landmarks=True)
-    assert report.merging.landmarks_merged > 100
 
 
 @pytest.mark.parametrize(("command", "times"), [("lc", 1), ("relax", 1), ("srelax", 1)])
@@ -193,29 +176,6 @@ def session(simulated: Path) -> Iterator[Session]:
         yield session
 
 
-def test_clouds_straighten_a_map(session: Session, simulated: Path, tmp_path: Path) -> None:
-    before: Any = session.run("evaluate_map", truth=simulated / "truth.npz")
-    assert session.run("check_map_consistency").failure == ""
-    report: Any = session.run("lc_lidar")
-    assert report.clouds == 11
-    assert report.edges_added == report.accepted > 3
-    listed: Any = session.run("lc_report")
-    assert listed.accepted == report.accepted
-    closure = listed.closures[0].id
-    assert session.run("why", subject=closure).failure == ""
-    session.run("optvi", ba_include_loop_closure_edges=True, ba_num_iterations=2)
-    session.run("undo")
-    session.run("relax")
-    after: Any = session.run("evaluate_map", truth=simulated / "truth.npz")
-    assert after.ate_m < 0.8 * before.ate_m
-    assert after.false_loop_edges == 0
-    session.run("save", map_folder=tmp_path / "map")
-    session.run("load", map_folder=tmp_path / "map")
-    assert session.run("lc_report").as_dict()["accepted"] >= 1
-    removed: Any = session.run("remove_loopclosure", closures=closure)
-    assert removed.edges_removed == 1
-
-
 def test_wrong_values_are_refused(session: Session, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(FlagError, match="lidar_lc_voxel_size_m"):
         session.run("lc_lidar", lidar_lc_voxel_size_m=0.0)
@@ -245,16 +205,6 @@ def closed_rooms() -> Session:
     closed_rooms.run("rename_mission", "tuesday", map_mission=second)
     closed_rooms.run("lc", lc_min_inlier_count=1000)
     return closed_rooms
-
-
-def test_the_argument_is_resolved(closed_rooms: Session) -> None:
-    closure = to_hex(closure_record.read_record(closed_rooms.vi_map).closures.id[0])[:8]
-    landmark = to_hex(closed_rooms.vi_map.landmarks.id[3])
-    assert isinstance(closed_rooms.run("why", closure), explanation.ClosureExplanation)
-    assert isinstance(closed_rooms.run("why", "monday"), explanation.MissionExplanation)
-    assert isinstance(closed_rooms.run("why", "tue"), explanation.MissionExplanation)
-    assert isinstance(closed_rooms.run("why", "monday", "tuesday"), explanation.PairExplanation)
-    assert isinstance(closed_rooms.run("why", landmark), LandmarkExplanation)
 
 
 def test_wrong_arguments(closed_rooms: Session) -> None:

@@ -2,12 +2,11 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from maplab_py.console.session.session import Session
 from maplab_py.errors import UserError
-from maplab_py.vimap import consistency, edits
+from maplab_py.vimap import consistency
 from tests.vimap.builders import walk_map
 
 
@@ -52,26 +51,6 @@ def test_sparsification_asks_for_a_number(session: Session, tmp_path: Path) -> N
     with pytest.raises(UserError, match="overwrite"):
         session.run("landmark_sparsify", num_landmarks_to_keep=15, coverage_csv=table)
     assert table.read_text() == "mine"
-
-
-def test_quality_commands_commit_what_they_report(session: Session) -> None:
-    judged = session.run("elq", elq_min_observers=10)
-    assert np.count_nonzero(session.vi_map.landmarks.quality == 2) == judged.good
-    left = session.run("rbl")
-    assert left.landmarks_removed == judged.bad > 0
-    assert len(session.vi_map.landmarks) == judged.good
-    assert session.run("rlq").unknown == judged.good
-
-
-def test_triangulation_and_tracks(session: Session) -> None:
-    report = session.run("rtl")
-    assert report.triangulated + report.too_few_observations == report.landmarks
-    m = session.vi_map
-    session.maps.add("bare", edits.remove_landmarks(m, np.ones(len(m.landmarks), dtype=bool)))
-    session.run("select", map_key="bare")
-    added = session.run("itl")
-    assert added.landmarks_added == len(session.vi_map.landmarks) == report.triangulated
-    assert session.run("rio").observations == added.observations_added
 
 
 def test_an_unknown_mission_is_refused(session: Session) -> None:

@@ -33,13 +33,6 @@ def test_one_base_frame_by_prefix_and_the_first_without(session: Session) -> Non
     assert known(session) == [True, False, False]
 
 
-def test_all_base_frames(session: Session) -> None:
-    session.run("set_all_mission_baseframes_to_known")
-    assert known(session) == [True] * 3
-    session.run("sabu")
-    assert known(session) == [False] * 3
-
-
 @pytest.mark.parametrize("command", ["sbk", "set_mission_baseframe_to_unknown", "rm"])
 def test_a_wrong_mission_is_an_error_and_not_the_first_one(session: Session, command: str) -> None:
     before = session.vi_map
@@ -80,19 +73,6 @@ def test_wrong_names(session: Session) -> None:
         session.run("rename_mission", "tuesday")
     with pytest.raises(UserError, match=r"no mission begins with 'wed'.*monday \(2000\)"):
         session.run("sbk", map_mission="wed")
-
-
-def test_map_stats_has_a_row_for_each_mission_and_details_of_a_chosen_one(
-    session: Session,
-) -> None:
-    session.run("rename_mission", "monday", map_mission="2")
-    table = session.run("map_stats").display()
-    assert [line.mission for line in table.missions][1] == "monday"
-    assert all(line.closures == 0 for line in table.missions)
-    assert table.summary.startswith("3 missions: ")
-    details = session.run("map_stats", map_mission="monday")
-    assert details.display() is details
-    assert [mission["name"] for mission in details.as_dict()["missions"]] == ["monday"]
 
 
 class Answering(SilentTerminal):
@@ -174,17 +154,6 @@ def test_only_some_missions_are_asked_about_and_named() -> None:
     assert report.text == "removed 1 mission: monday"  # type: ignore[attr-defined]
     assert terminal.questions == ["remove mission monday?"]
     assert terminal.notes[0].startswith("mission 1 of 1: monday, id 2000")
-
-
-def test_facts_of_a_mission() -> None:
-    terminal = Answering("quit")
-    session = Session(terminal=terminal)
-    session.maps.add("walk", walk_map())
-    session.run("rmi")
-    (note,) = terminal.notes
-    assert note.endswith("12 vertices")
-    assert " m, " in note
-    assert " s, " in note
 
 
 def test_scripts_are_refused_in_one_line_and_dry_runs_ask_nothing() -> None:

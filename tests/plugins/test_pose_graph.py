@@ -97,25 +97,6 @@ def test_wrong_files_are_errors(session: Session, tmp_path: Path, text: str, mes
         session.run("relax_external")
 
 
-def test_a_graph_is_exported_imported_and_relaxed(session: Session, tmp_path: Path) -> None:
-    session.run("lc", lc_insert_lc_edge_instead_of_merging=True)
-    exported = session.run("export_g2o", file=tmp_path / "rooms.g2o")
-    vertices = len(session.vi_map.vertices)
-    assert f"{vertices} poses" in exported.text
-    session.run("import_g2o", file=tmp_path / "rooms.g2o", map_key="graph")
-    graph = session.vi_map
-    assert len(graph.vertices) == vertices
-    truth = make_map(TWICE)[1]
-    before = np.linalg.norm(graph.T_G_I[:, 4:] - truth[:, 4:], axis=1).max()
-    report = session.run("relax")
-    assert report.failure == ""
-    assert "no Binary descriptors" in report.loop_closures.notes[0]
-    assert len(session.vi_map.loop_closure_edges) == len(graph.loop_closure_edges) > 0
-    after = np.linalg.norm(session.vi_map.T_G_I[:, 4:] - truth[:, 4:], axis=1).max()
-    assert after < 0.5 * before
-    session.run("check_map_consistency")
-
-
 @pytest.fixture
 def walk_session() -> Session:
     walk_session = Session()
@@ -123,44 +104,6 @@ def walk_session() -> Session:
     return walk_session
 
 
-def test_edges_get_uncertainties_and_switch_variables(walk_session: Session) -> None:
-    walk_session.run(
-        "aeu",
-        edge_type="loop_closure",
-        translation_std_dev_meters=0.5,
-        orientation_std_dev_degrees=1.0,
-    )
-    assert walk_session.vi_map.loop_closure_edges.covariance[0, 0, 0] == pytest.approx(0.25)
-    walk_session.run("asvv", lc_switch_variable_value=0.5)
-    walk_session.run("asvuflce", lc_switch_variable_variance=1e-4)
-    assert walk_session.vi_map.loop_closure_edges.switch_variable.tolist() == [0.5, 0.5]
-    assert walk_session.vi_map.loop_closure_edges.switch_variable_variance.tolist() == [1e-4, 1e-4]
-
-
 def test_sigmas_must_be_given(walk_session: Session) -> None:
     with pytest.raises(FlagError, match="translation_std_dev_meters"):
         walk_session.run("assign_edge_uncertainties", edge_type="odometry")
-
-
-def test_vertices_are_disturbed_and_undo_puts_them_back(walk_session: Session) -> None:
-    before = walk_session.vi_map
-    report = walk_session.run("artificially_disturb_vertices")
-    assert report.largest_shift_m > 0.0
-    assert np.abs(walk_session.vi_map.vertices.T_M_I - before.vertices.T_M_I).max() > 0.0
-    walk_session.run("undo")
-    assert walk_session.vi_map is before
-
-
-def test_missions_are_laid_apart(walk_session: Session) -> None:
-    assert "1 mission " in walk_session.run("spatially_distribute_missions").text
-    np.testing.assert_array_equal(walk_session.vi_map.T_G_M[0, 4:], [20.0, 0.0, 0.0])
-    walk_session.run("set_all_mission_baseframes_to_known")
-    assert "nothing" in walk_session.run("spatially_distribute_missions").text
-
-
-def test_statistics_and_size_change_nothing(walk_session: Session) -> None:
-    before = walk_session.vi_map
-    assert any("track" in line.quantity for line in walk_session.run("statistics").quantities)
-    size = walk_session.run("map_size")
-    assert {kind.kind for kind in size.kinds} >= {"descriptors", "IMU samples", "landmarks"}
-    assert walk_session.vi_map is before

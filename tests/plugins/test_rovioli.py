@@ -6,11 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from maplab_py.cancellation import CancelToken, current_token, obeying
 from maplab_py.console.session.session import Session
-from maplab_py.errors import Cancelled, EstimationError, FlagError, MapError, UserError
+from maplab_py.errors import EstimationError, FlagError, MapError, UserError
 from maplab_py.frontend import finishing
-from maplab_py.frontend.mapping import Mapping
 from maplab_py.frontend.reports import MappingReport
 from maplab_py.simulation.scenario import MotionOptions
 from maplab_py.storage.native import SaveReport, load_map, save_map
@@ -58,28 +56,6 @@ def test_the_map_is_saved_and_selected(walk: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_other_commands_take_the_map(walk: Path, tmp_path: Path) -> None:
-    with Session() as session:
-        run(session, walk)
-        assert session.maps.selected_key == "rovioli"
-        assert not session.maps.selected.is_saved
-        session.run("check_map_consistency")
-        assert session.run("optvi").failure == ""
-        summary = tmp_path / "summary"
-        session.run("summary_map", summary_map_save_path=summary)
-        localized = session.run("localize", localization_map=str(summary))
-        assert localized.failure == ""
-        assert session.run("kfh").failure == ""
-        closing = session.run("lc")  # the walk has no loop, which is no failure
-        assert closing.failure == ""
-        assert closing.reason.startswith("no loop closures")
-        assert session.run("optvi").failure == ""
-        assert session.run("elq").failure == ""
-        session.run("save", map_folder=tmp_path / "map")
-        assert consistency.check_consistency(load_map(tmp_path / "map")[0]).failure == ""
-
-
-@pytest.mark.slow
 def test_a_localisation_map_keeps_a_share_of_the_landmarks(walk: Path) -> None:
     with Session() as session:
         whole = run(session, walk, map_key="all", optimize_map_to_localization_map=True)
@@ -122,27 +98,6 @@ def test_an_existing_target_is_refused_before_any_work(walk: Path, tmp_path: Pat
         assert len(load_map(target)[0].vertices) == report.vertices
 
 
-def test_an_error_in_the_recording_is_reported_and_the_map_saved(
-    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    plain = Mapping._take
-    count = 0
-
-    def failing(mapping: Mapping, *words: object) -> None:
-        nonlocal count
-        count += 1
-        if count == 60:
-            raise MapError("cam0/60.png: the image is truncated; copy it again")
-        plain(mapping, *words)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(Mapping, "_take", failing)
-    with Session() as session:
-        report = run(session, walk, save_map_folder=tmp_path / "map")
-        assert report.failure.startswith("cam0/60.png: the image is truncated")
-        assert len(session.vi_map.vertices) == report.vertices > 20
-    assert len(load_map(tmp_path / "map")[0].vertices) == report.vertices
-
-
 def test_a_map_that_cannot_be_saved_where_it_should_is_saved_elsewhere(
     walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -174,49 +129,6 @@ def test_a_map_that_cannot_be_saved_where_it_should_is_saved_elsewhere(
 
 def refuse() -> SaveReport:
     raise UserError("no room")
-
-
-@pytest.mark.parametrize("is_saved", [False, True])
-def test_ctrl_c_ends_the_recording_and_keeps_the_map(
-    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_saved: bool
-) -> None:
-    press_at_frame(monkeypatch, 60)
-    folder = {"save_map_folder": tmp_path / "map"} if is_saved else {}
-    with Session() as session, obeying(CancelToken()):
-        report = run(session, walk, map_key="part", **folder)
-        assert report.failure == ""
-        assert report.frames == 60
-        assert session.maps.selected_key == "part"
-        assert len(session.vi_map.vertices) == report.vertices > 20
-        assert session.maps.selected.is_saved == is_saved
-        assert consistency.check_consistency(session.vi_map).failure == ""
-        session.run("save", map_folder=tmp_path / "saved_later")
-    for name in ("saved_later", *(["map"] if is_saved else [])):
-        assert len(load_map(tmp_path / name)[0].vertices) == report.vertices
-
-
-def test_a_second_ctrl_c_leaves_the_session_as_it_was(
-    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    press_at_frame(monkeypatch, 60, 60)
-    with Session() as session, obeying(CancelToken()):
-        with pytest.raises(Cancelled):
-            run(session, walk, save_map_folder=tmp_path / "map")
-        assert len(session.maps) == 0
-    assert not (tmp_path / "map").exists()
-
-
-def press_at_frame(monkeypatch: pytest.MonkeyPatch, *frames: int) -> None:
-    """Press Ctrl-C after some frames of a run."""
-    plain = Mapping._take
-
-    def interrupted(mapping: Mapping, *words: object) -> None:
-        plain(mapping, *words)  # type: ignore[arg-type]
-        for _ in range(frames.count(mapping.statistics.frames)):
-            token = current_token()
-            token.cancelled = not token.request_end()
-
-    monkeypatch.setattr(Mapping, "_take", interrupted)
 
 
 @pytest.mark.parametrize(
@@ -265,12 +177,6 @@ def test_wrong_requests_are_refused_in_one_line(
             session.run("rovioli", **given)
         assert "\n" not in str(error.value)
         assert len(session.maps) == 0
-
-
-def test_a_recording_that_does_not_start_says_why(tmp_path: Path) -> None:
-    folder = write_folder(make_content(), tmp_path / "images")
-    with Session() as session, pytest.raises(EstimationError, match="has not started: "):
-        run(session, folder)
 
 
 def test_cameras_that_are_not_triggered_together_are_named(tmp_path: Path) -> None:

@@ -91,12 +91,6 @@ def test_ctrl_c_leaves_no_thread_that_writes_the_database(
     assert session.vi_map is before
 
 
-def test_batch_uses_everything(session: Session) -> None:
-    report = session.run("self_calibrate", batch=True, **FLAGS)
-    assert report.keyframes == 61
-    assert abs(focal_px(session) - 310.0) <= 1.0
-
-
 def test_collect_show_prune_and_export(session: Session, tmp_path: Path) -> None:
     database = tmp_path / "device.segments"
     planned = session.run("collect_segments", database=database, dry_run=True, **FLAGS)

@@ -52,18 +52,6 @@ def test_simulated_maps_are_evaluated_against_their_truth(tmp_path: Path, scenar
     assert trajectory.scale is not None
 
 
-def test_seed_changes_the_data_and_repeats_it(tmp_path: Path, scenario: Path) -> None:
-    session = Session()
-    maps = []
-    for name, seed in (("a", 5), ("b", 5), ("c", 6)):
-        folder = tmp_path / name
-        session.run("simulate", scenario=str(scenario), seed=seed, map_folder=folder)
-        maps.append(load_map(folder / "session_1")[0])
-    one, same, other = (vi_map.keypoints.uv_px.tobytes() for vi_map in maps)
-    assert one == same
-    assert one != other
-
-
 def test_simulate_refuses_a_folder_in_use(tmp_path: Path, scenario: Path) -> None:
     session = Session()
     (tmp_path / "used").mkdir()

@@ -2,7 +2,6 @@
 
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from maplab_py.storage.mission_names import named
 from maplab_py.storage.native import load_map, save_map
 from maplab_py.storage.resources.files import missing_files
 from maplab_py.storage.resources.new import NewResources
-from maplab_py.vimap import NO_ROW, ResourceOwner, Resources, VIMap, comparison
+from maplab_py.vimap import VIMap, comparison
 from tests.console.sample_plugin import map_of
 from tests.vimap.builders import walk_map
 
@@ -179,18 +178,6 @@ def test_what_another_console_has_saved_is_replaced_only_by_force(
             other.run("save")
 
 
-def test_two_maps_of_one_console_do_not_replace_each_other(
-    session: Session, disk: dict[Path, VIMap], tmp_path: Path
-) -> None:
-    for key in ("a", "b"):
-        session.run("load", map_folder=tmp_path / "walk_0", map_key=key)
-    session.run("load_merge_map", map_folder=tmp_path / "walk_1")
-    session.run("save")
-    session.run("select_map", "a")
-    with pytest.raises(UserError, match="--force"):
-        session.run("save")
-
-
 def test_save_all_keeps_account_of_what_was_saved_before_it_failed(
     session: Session, disk: dict[Path, VIMap], tmp_path: Path
 ) -> None:
@@ -217,13 +204,6 @@ def test_a_command_without_effect_does_not_mark_the_map(
     session.run("set_map_folder", map_folder=tmp_path / "walk_0")
     assert session.maps.selected.is_saved
     assert session.maps.selected == entry
-
-
-def test_map_folder_can_be_chosen(session: Session, tmp_path: Path) -> None:
-    session.maps.add("a", map_of(1), is_saved=True)
-    session.run("set_map_folder", map_folder=tmp_path)
-    assert session.run("get_map_folder") == Message(str(tmp_path))
-    assert not session.maps.selected.is_saved
 
 
 def test_maps_in_memory(session: Session) -> None:
@@ -279,50 +259,3 @@ def test_undo_redo_snapshot_restore(session: Session) -> None:
     assert session.vi_map is first
     with pytest.raises(UserError, match="there are: start"):
         session.run("restore", name="strat")
-
-
-def test_information(session: Session) -> None:
-    session.maps.add("empty", VIMap())
-    for command in ("print_baseframes", "print_camera_calibrations"):
-        with pytest.raises(UserError, match="map 'empty' has no"):
-            session.run(command)
-    session.maps.add("walk", walk_map(seed=1))
-    vi_map = session.vi_map
-    statistics: Any = session.run("map_stats")
-    assert statistics.missions[0].vertices == len(vi_map.vertices)
-    baseframes: Any = session.run("print_baseframes")
-    np.testing.assert_array_equal(baseframes.baseframes[0].p_G_M, vi_map.T_G_M[0, 4:])
-    cameras: Any = session.run("print_camera_calibrations")
-    assert cameras.cameras[0].size_px == "640 x 480"
-    shared: Any = session.run("mission_coobservability_stats")
-    assert len(shared.missions) == 1
-    assert session.run("check_map_consistency").failure == ""
-
-
-def test_an_inconsistent_map_fails(session: Session) -> None:
-    vi_map = walk_map(seed=1)
-    T_M_I = vi_map.vertices.T_M_I.copy()
-    T_M_I[2, 0] = np.nan
-    session.maps.add("bad", vi_map.replace(vertices=vi_map.vertices.replace(T_M_I=T_M_I)))
-    assert session.run("check_map_consistency").failure
-
-
-def test_resource_folders(session: Session, tmp_path: Path) -> None:
-    resources = Resources.filled(
-        3, type=[1, 1, 16], owner_kind=[ResourceOwner.FRAME] * 3, owner=[NO_ROW] * 3
-    )
-    session.maps.add("a", VIMap(resources=resources))
-    counted: Any = session.run("resource_statistics")
-    assert [(t.resource_type, t.resources) for t in counted.types] == [
-        ("undistorted_images", 2),
-        ("point_cloud", 1),
-    ]
-    session.run("use_external_resource_folder", resource_folder=tmp_path)
-    session.run("use_external_resource_folder", resource_folder=tmp_path)
-    folders: Any = session.run("list_resource_folders")
-    assert [f.is_used_for_new for f in folders.folders] == [False, True]
-    assert folders.folders[0].resources == 3
-    session.run("use_map_resource_folder")
-    assert session.vi_map.metadata.resource_folder_in_use == -1
-    with pytest.raises(UserError, match="no such folder"):
-        session.run("use_external_resource_folder", resource_folder=tmp_path / "missing")

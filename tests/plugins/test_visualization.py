@@ -51,17 +51,6 @@ def _layers(report) -> dict[str, tuple[int, bool]]:
     return {line.layer: (line.in_map, line.visible) for line in report.layers}
 
 
-def test_visualize_reports_what_is_shown(session: Session) -> None:
-    report = session.run("v")
-    assert report.url.startswith("http://127.0.0.1:")
-    layers = _layers(report)
-    assert layers["Vertices"] == (12, True)
-    assert layers["Landmarks"] == (60, True)
-    assert layers["IMU edges"] == (11, False)
-    assert layers["Loop closures"] == (2, True)
-    assert session.run("visualize").url == report.url  # one viewer for the session
-
-
 def test_the_view_follows_every_command(session: Session) -> None:
     session.run("visualize")
     viewer = _viewer(session)
@@ -169,33 +158,6 @@ def test_difference_to_a_snapshot_and_to_the_state_before(session: Session) -> N
     assert _layers(report.view)["Names"] == (2, True)
 
 
-def test_loop_closures_only(session: Session) -> None:
-    layers = _layers(session.run("visualize_loop_closures"))
-    assert layers["Loop closures"] == (2, True)
-    assert not layers["Landmarks"][1]
-    edges = session.vi_map.loop_closure_edges.take(np.zeros(2, dtype=bool))
-    without = session.vi_map.replace(loop_closure_edges=edges)
-    session.maps.update(session.maps.selected.with_value(without, "removing"))
-    with pytest.raises(UserError, match="has no loop closures"):
-        session.run("visualize_loop_closures")
-
-
-def test_observers_and_sensors(session: Session) -> None:
-    observers = _layers(session.run("visualize_landmark_observers"))
-    assert observers["Landmark observers"] == (len(session.vi_map.observations), True)
-    sensors = _layers(session.run("visualize_sensor_extrinsics"))
-    assert sensors == {"Sensors": (2, True)}
-
-
-def test_missions_are_played(session: Session) -> None:
-    session.run("visualize_sequentially", vis_seq_steps=20, vis_seq_vertex_frequency=1.0)
-    player = _viewer(session).player
-    assert player is not None
-    assert player.step <= 1
-    with pytest.raises(UserError, match="no mission begins with 'ffff0000'"):
-        session.run("vs", map_mission="ffff0000")
-
-
 def test_ground_truth_from_a_file(session: Session, tmp_path: Path) -> None:
     vi_map = session.vi_map
     truth = Trajectory(vi_map.vertices.timestamp_ns, vi_map.T_G_I)
@@ -252,12 +214,6 @@ def test_without_a_browser_save_view_says_what_to_do(
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(UserError, match="no page is open and no Chromium is installed: open http"):
         session.run("save_view", file=tmp_path / "view.png")
-
-
-def test_an_empty_map_is_refused(session: Session) -> None:
-    session.run("create_new_map", map_key="empty")
-    with pytest.raises(UserError, match="'empty' has no vertices"):
-        session.run("visualize")
 
 
 @pytest.fixture
@@ -354,16 +310,6 @@ def test_depth_maps_become_points(with_resources: Session) -> None:
     # the principal point is at (320, 240): the ray is the optical axis
     expected = se3.transform(_T_G_C(vi_map, 4), np.array([[0.0, 0.0, 2.5]]))
     np.testing.assert_allclose(_cloud(with_resources), expected, atol=1e-6)
-
-
-def test_images_are_those_of_the_vertex(with_resources: Session) -> None:
-    with_resources.run("visualize_raw_images")
-    image_of = _viewer(with_resources).drawing.images
-    shown = image_of(2)
-    assert shown is not None
-    assert shown.shape == (24, 32, 3)
-    assert (shown == 120).all()
-    assert image_of(0) is None
 
 
 def test_resources_that_are_missing_are_named(with_resources: Session, session: Session) -> None:
