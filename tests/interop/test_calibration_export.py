@@ -14,8 +14,8 @@ from maplab_py.interop.calibration_export import (
     lower_triangular,
     rotated_lower_triangular,
 )
-from maplab_py.sensors import Distortion, sensors_yaml
-from tests.algorithms.self_calibration.scenes import INTRINSICS, device, scene_map
+from maplab_py.sensors import Distortion
+from tests.algorithms.self_calibration.scenes import INTRINSICS, scene_map
 from tests.support.imu_model import distort_imu
 
 FORCE_I, TURN_I, POINT_I = np.random.default_rng(3).normal(size=(3, 20, 3))
@@ -94,12 +94,3 @@ def test_basalt_means_the_same() -> None:
     np.testing.assert_allclose(turn_i, TURN_I @ R_i_I.T, atol=1e-9)
     p_C = (POINT_I @ R_i_I.T - p) @ so3.to_matrix(q)
     np.testing.assert_allclose(p_C, point_in_camera(), atol=1e-9)
-
-
-def test_maplab_yaml_reads_back() -> None:
-    again = sensors_yaml.parse_sensors(written("maplab")["sensors.yaml"], "exported")
-    imu, rig = device(scene_map(distortion=Distortion.RADTAN))
-    np.testing.assert_allclose(again.imu(imu.id).intrinsics.T_g, INTRINSICS.T_g, atol=1e-15)
-    np.testing.assert_allclose(
-        again.camera_rig(rig.id).cameras[0].intrinsics, rig.cameras[0].intrinsics
-    )

@@ -15,7 +15,7 @@ from maplab_py.interop.calibration_import import CalibrationFile, import_calibra
 from maplab_py.sensors import Distortion, Projection, SensorSet
 from maplab_py.sensors.camera import CAMERA_MODELS, Camera
 from maplab_py.sensors.sensors_yaml import parse_sensors, write_sensors
-from tests.algorithms.self_calibration.scenes import INTRINSICS, scene_map
+from tests.algorithms.self_calibration.scenes import scene_map
 from tests.support.scene import Scene
 
 CAMCHAIN = """cam0:
@@ -193,31 +193,6 @@ def test_basalt(tmp_path: Path) -> None:
     np.testing.assert_allclose(T_I_C[1], [1, 0, 0, 0, 0, 0.2, 0.3], atol=1e-15)
 
 
-@pytest.mark.parametrize("form", ["maplab", "kalibr", "openvins", "basalt"])
-def test_exports_read_back_as_the_same_device(form: str, tmp_path: Path) -> None:
-    vi_map = scene_map(distortion=Distortion.RADTAN)
-    device = device_of(vi_map)
-    for name, text in exported(vi_map.sensors, *device, form, imu_rate_hz=200.0).items():
-        written(tmp_path, name, text)
-    files = sorted(tmp_path.iterdir(), key=lambda path: "cam" not in path.name)
-    result = import_calibration(*files)
-    intrinsics = result.sensors.imu(result.imu_id).intrinsics
-    assert intrinsics is not None
-    for name in ("T_g", "T_a", "R_A_I"):
-        np.testing.assert_allclose(
-            getattr(intrinsics, name), getattr(INTRINSICS, name), atol=1e-9, err_msg=name
-        )
-    T_I_C = result.sensors.T_I_C(result.imu_id, result.rig_id)
-    np.testing.assert_allclose(T_I_C, vi_map.sensors.T_I_C(*device), atol=1e-9)
-    own = vi_map.sensors.camera_rig(device.rig).cameras[0]
-    np.testing.assert_allclose(cameras(result)[0].intrinsics, own.intrinsics)
-    # and the map that it is given to stays as it was
-    after = with_calibration_file(vi_map, result)
-    np.testing.assert_allclose(
-        after.sensors.T_I_C(*device), vi_map.sensors.T_I_C(*device), atol=1e-9
-    )
-
-
 def test_a_map_takes_over_what_the_file_has(tmp_path: Path) -> None:
     vi_map = scene_map(distortion=Distortion.RADTAN)
     device = device_of(vi_map)
@@ -262,16 +237,12 @@ def test_a_map_takes_over_what_the_file_has(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (CAMCHAIN.replace("pinhole", "ocam"), "'ocam' is not supported"),
-        (CAMCHAIN.replace("0.004", "4000000.0"), "below 10 s"),
         (CAMCHAIN.replace("640, 480", "640"), "'resolution' needs 2"),
         (CAMCHAIN.replace("[1.0, 0.0, 0.0, 0.02]", "[1.0, 1.0, 0.0, 0.02]"), "not a rotation"),
         (CAMCHAIN.replace("401.0", ".nan"), "not finite"),
         ("cam0: 3\n", "key-value pairs"),
-        ("something: else\n", "format is not known"),
         ("cam0: [", "not valid YAML"),
         (IMU.replace("0.01", "-1.0"), "must be positive"),
-        ("[1, 2]", "key-value pairs"),
         ("", "key-value pairs"),
     ],
 )

@@ -127,28 +127,6 @@ def test_tables_can_be_left_out(tmp_path: Path, name: str) -> None:
     assert export_csv_dataset(make_map(), tmp_path, options).files == 10
 
 
-class FirstTwoBytes:
-    """Stands for a projection: halves of the first two bytes of descriptors of 48 bytes."""
-
-    descriptor_size = 48
-
-    def project(self, descriptors: np.ndarray) -> np.ndarray:
-        assert descriptors.shape[1] == self.descriptor_size
-        return (descriptors[:, :2] / np.float32(3.0)).astype(np.float32)
-
-
-def test_projected_descriptors_are_read_back_exactly(tmp_path: Path) -> None:
-    vi_map = make_map()
-    export_csv_dataset(vi_map, tmp_path, CsvExportOptions(), projector=FirstTwoBytes())
-    first, second = (tmp_path / text for text in ids.to_hex_list(vi_map.missions.id))
-    lines = (first / "descriptors.csv").read_text().splitlines()
-    read = np.array([line.split(", ") for line in lines], dtype=np.float32)
-    expected = FirstTwoBytes().project(vi_map.keypoints.descriptor[:24, :48])
-    assert np.array_equal(read, expected)
-    # descriptors of another length than the projection takes have an empty row
-    assert (second / "descriptors.csv").read_text() == "\n" * 24
-
-
 IDENTITY = "1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1"
 
 
@@ -241,11 +219,6 @@ def test_parameters_of_other_edges_are_skipped(tmp_path):
     write_g2o(small_graph(), plain)
     path.write_text("PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1\n" + plain.read_text())
     assert read_g2o(path).id.tolist() == small_graph().id.tolist()
-
-
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(MapError, match=r"cannot read .*nowhere\.g2o"):
-        read_g2o(tmp_path / "nowhere.g2o")
 
 
 def test_compressed_files_are_unpacked(tmp_path):

@@ -12,24 +12,18 @@ from maplab_py.algorithms.self_calibration.device import device_of
 from maplab_py.console.session.session import Session
 from maplab_py.frontend.localization.record import _HEADER as LOCALIZED_HEADER
 from maplab_py.geometry import se3, so3
-from maplab_py.interop import mesh_files, vertex_states
-from maplab_py.interop.bags.exporting import export_bag
-from maplab_py.interop.bags.options import BagExportOptions
+from maplab_py.interop import vertex_states
 from maplab_py.interop.calibration_export import exported
-from maplab_py.interop.colmap.options import ColmapExportOptions
 from maplab_py.interop.csv_dataset import CsvExportOptions, export_csv_dataset
 from maplab_py.interop.imu_csv import read_imu_csv
-from maplab_py.interop.ply import PlyCloud, write_ply
-from maplab_py.interop.recordings import bag_writing, map_replay, reader_choice
+from maplab_py.interop.recordings import reader_choice
 from maplab_py.interop.recordings.options import SourceOptions
-from maplab_py.interop.resources.point_clouds import read_cloud
 from maplab_py.interop.trajectories import Trajectory, read_trajectory, write_euroc, write_tum
-from maplab_py.sensors import Distortion, sensors_yaml
+from maplab_py.sensors import Distortion
 from maplab_py.storage.native import save_map
 from maplab_py.vimap import VIMap
 from tests.algorithms.self_calibration.scenes import scene_map
 from tests.algorithms.test_external_trajectories import flat_map
-from tests.interop.bags.small_bags import map_with_resources, named
 from tests.interop.small_map import VERTICES
 
 Write = Callable[[VIMap, Path], Path]
@@ -154,21 +148,6 @@ def test_imu_samples_of_the_table_are_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read.accel_gyro, vi_map.imu_samples.accel_gyro[rows])
 
 
-@pytest.mark.parametrize("form", ["binary", "text"])
-def test_colmap_models_are_read_as_maps_and_calibrations(form: str, tmp_path: Path) -> None:
-    from maplab_py.interop.colmap.exporting import export_colmap
-    from tests.interop.colmap.test_round_trip import PINHOLES, Scene
-
-    vi_map = Scene(missions=1, vertices=6, models=PINHOLES[:2]).make()
-    export_colmap(vi_map, tmp_path, ColmapExportOptions(quality="all", colmap_format=form))
-    with Session() as session:
-        report: Any = session.run("import_colmap", colmap_folder=tmp_path, map_key="again")
-        assert report.frames == len(vi_map.frames)
-        np.testing.assert_allclose(session.vi_map.T_G_I, vi_map.T_G_I, atol=1e-12)
-        report = session.run("import_calibration", calibration_file=tmp_path)
-        assert len(report.cameras) == 2
-
-
 def calibrations(vi_map: VIMap, folder: Path, form: str) -> tuple[Path, ...]:
     """Write the device of a map as every command does; return the files, cameras first."""
     if form == "save":
@@ -207,51 +186,8 @@ def test_calibrations_are_read_by_the_import_and_by_flags(form: str, tmp_path: P
         return
     np.testing.assert_allclose(read.T_I_C, vi_map.sensors.T_I_C(*device), atol=1e-9)
     imu, own_imu = read.sensors.imu(read.imu_id), vi_map.sensors.imu(device.imu)
+    for name in ("T_g", "T_a", "R_A_I"):
+        values = (getattr(of.intrinsics, name) for of in (imu, own_imu))
+        np.testing.assert_allclose(*values, atol=1e-9, err_msg=name)
     assert imu.acc_noise_density == pytest.approx(own_imu.acc_noise_density, rel=1e-12)
     assert imu.gyro_noise_density == pytest.approx(own_imu.gyro_noise_density, rel=1e-12)
-
-
-def test_graphs_are_read_with_their_values(tmp_path: Path) -> None:
-    vi_map = flat_map()
-    with Session() as session:
-        session.maps.add("small", vi_map)
-        session.run("export_g2o", file=tmp_path / "graph.g2o")
-        session.run("import_g2o", file=tmp_path / "graph.g2o", map_key="graph")
-        graph = session.vi_map
-    np.testing.assert_allclose(graph.T_G_I[:, 4:], vi_map.T_G_I[:, 4:], atol=1e-9)
-    turns = so3.multiply(so3.inverse(graph.T_G_I[:, :4]), vi_map.T_G_I[:, :4])
-    assert np.linalg.norm(so3.log(turns), axis=1).max() < 1e-9
-
-
-@pytest.mark.parametrize("kind", bag_writing.BagFormat)
-def test_bags_are_described_by_recording_info(kind: bag_writing.BagFormat, tmp_path: Path) -> None:
-    vi_map, images, _ = map_with_resources()
-    path = named(tmp_path, kind)
-    export_bag(vi_map, tmp_path, 0, path, BagExportOptions(format=kind.value))
-    (tmp_path / "sensors.yaml").write_text(sensors_yaml.write_sensors(vi_map.sensors))
-    with Session() as session:
-        report: Any = session.run(
-            "recording_info",
-            recording=path,
-            sensor_calibration_file=tmp_path / "sensors.yaml",
-            imu_topic="/imu0",
-        )
-    assert report.frame_sets == len(images)
-    assert report.imu.samples == len(map_replay.mission_sample_rows(vi_map, 0))
-    assert report.notes == ()
-
-
-def test_clouds_are_read_as_resources_and_meshes(tmp_path: Path) -> None:
-    p = np.random.default_rng(5).normal(size=(12, 3)).astype(np.float32).astype(np.float64)
-    colours = np.arange(36, dtype=np.uint8).reshape(12, 3)
-    for cloud in (PlyCloud(p), PlyCloud(p, colours), PlyCloud(p, intensity=p[:, 0])):
-        write_ply(cloud, tmp_path / "cloud.ply")
-        read = read_cloud(tmp_path / "cloud.ply")
-        np.testing.assert_array_equal(read.p, p)
-        for name in ("colours", "intensity"):
-            np.testing.assert_array_equal(getattr(read, name), getattr(cloud, name))
-    faces = np.arange(12, dtype=np.int32).reshape(4, 3)
-    for suffix in (".ply", ".obj", ".stl", ".glb"):
-        mesh_files.write_mesh(p, faces, tmp_path / f"mesh{suffix}", colours)
-        mesh = mesh_files.read_mesh(tmp_path / f"mesh{suffix}")
-        np.testing.assert_allclose(mesh.p[mesh.faces], p[faces], atol=1e-6)

@@ -283,16 +283,6 @@ def test_wrong_files_are_refused(tmp_path: Path, lines: tuple[str, ...], message
         calibration_import.import_calibration(cameras_txt(tmp_path, *lines))
 
 
-def test_a_cut_binary_file_is_refused(rig_map, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
-    export_colmap(rig_map, tmp_path / "model", ColmapExportOptions())
-    path = tmp_path / "model" / "cameras.bin"
-    data = path.read_bytes()
-    for size in range(0, len(data), 29):
-        path.write_bytes(data[:size])
-        with pytest.raises(MapError, match=r"cameras\.bin: is damaged"):
-            calibration_import.import_calibration(path)
-
-
 @pytest.mark.parametrize(("name", "number"), [("SIFT", 3), ("Binary", 0)])
 def test_a_database_of_one_type(tmp_path: Path, name: str, number: int) -> None:
     vi_map = two_types()

@@ -33,7 +33,6 @@ from tests.interop.recordings.written import (
     write_folder,
     write_messages,
 )
-from tests.support.data import shared_data
 from tests.support.own_process import in_own_process
 
 pytest.importorskip("rosbags")
@@ -105,59 +104,6 @@ def test_compressed_jpeg(tmp_path: Path, calibrated: SourceOptions) -> None:
     data = cv2.imencode(".jpg", content.images[1][0])[1]
     expected = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(frame_set.images[1].decode(), expected)
-
-
-@pytest.mark.parametrize("part", [StreamOptions(), StreamOptions(start_s=0.1, end_s=0.25)])
-def test_bag_and_folder_give_the_same_events(
-    tmp_path: Path, calibrated: SourceOptions, part: StreamOptions
-) -> None:
-    content = make_content()
-    bag = write_bag(content, tmp_path / "room.bag", delay_ns=(2_000_000, 80_000_000))
-    folder = write_folder(content, tmp_path / "room")
-    streams = [
-        EventStream(open_recording(path, o), part)
-        for path, o in ((bag, calibrated), (folder, None))
-    ]
-    from_bag, from_folder = [list(stream) for stream in streams]
-    assert [s.time_ns for s in frame_sets(from_bag)] == [s.time_ns for s in frame_sets(from_folder)]
-    for a, b in zip(samples(from_bag), samples(from_folder), strict=True):
-        np.testing.assert_array_equal(a, b)
-    for ours, theirs in zip(frame_sets(from_bag), frame_sets(from_folder), strict=True):
-        for a, b in zip(ours.images, theirs.images, strict=True):
-            np.testing.assert_array_equal(a.decode(), b.decode())
-    assert streams[0].statistics == streams[1].statistics
-
-
-def test_a_real_recording_as_a_bag(tmp_path: Path) -> None:
-    """One second of MH_01: the folder's events again, the JPEG files as compressed images."""
-    options = StreamOptions(end_s=1.5)
-    folder = open_recording(shared_data("euroc_mh01_10s"))
-    events = list(EventStream(folder, options))
-    times_ns, accel_gyro = samples(events)
-    messages: list[tuple[int, str, Any]] = [
-        (t, "/imu0", imu_message(STORE, t, v, 1))
-        for t, v in zip(times_ns.tolist(), accel_gyro, strict=True)
-    ]
-    kind = STORE.types["sensor_msgs/msg/CompressedImage"]
-    for frame_set in frame_sets(events):
-        for image in frame_set.images:
-            data = np.frombuffer(image.data._checked_bytes(), dtype=np.uint8)  # type: ignore[attr-defined]
-            head = imu_message(STORE, image.stamp_ns, np.zeros(6), 1).header
-            message = kind(head, "jpeg", data)
-            messages.append((image.stamp_ns, f"/cam{image.camera}/image_raw", message))
-    messages.sort(key=lambda entry: entry[0])
-    write_messages(tmp_path / "mh01.bag", STORE, messages)
-    chain = SourceOptions(
-        sensor_calibration_file=shared_data("euroc_imu/kalibr_imucam_chain.yaml"),
-        imu_calibration_file=shared_data("euroc_imu/kalibr_imu_chain.yaml"),
-    )
-    bag = open_recording(tmp_path / "mh01.bag", chain)
-    again = list(EventStream(bag))
-    assert len(frame_sets(again)) == len(frame_sets(events)) == 20
-    np.testing.assert_array_equal(samples(again)[1], accel_gyro)
-    first, same = frame_sets(events)[3].images[1], frame_sets(again)[3].images[1]
-    np.testing.assert_array_equal(first.grey(), same.grey())
-    np.testing.assert_allclose(bag.device.T_I_C, folder.device.T_I_C, atol=1e-12)
 
 
 def test_topics_of_flags_and_the_time_offset(tmp_path: Path, device: RecordedSensors) -> None:

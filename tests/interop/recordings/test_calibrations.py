@@ -14,12 +14,11 @@ from maplab_py.interop.calibration_import import (
     import_calibration,
     read_calibration,
 )
-from maplab_py.interop.calibrations.kalibr import upper_triangular_and_rotation
 from maplab_py.interop.device import DeviceOptions, RecordedSensors, make_device
 from maplab_py.interop.recordings.options import SourceOptions
 from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.sensors import Camera, Distortion, Imu, ImuIntrinsics, Projection
-from maplab_py.sensors.sensors_yaml import parse_sensors, write_sensors
+from maplab_py.sensors.sensors_yaml import write_sensors
 from tests.interop.recordings.written import make_content, write_calibration, write_folder
 from tests.interop.test_calibration_import import CAMCHAIN, IMU
 from tests.support.data import shared_data
@@ -55,25 +54,6 @@ def test_kalibr_of_euroc() -> None:
     assert (imu.topic, imu.intrinsics) == ("/imu0", None)
     folder = import_calibration(shared_data("euroc_mh01_10s/mav0"))
     np.testing.assert_allclose(folder.T_I_C, device.T_I_C, atol=1e-12)
-
-
-def test_kalibr_of_tum_vi() -> None:
-    device = read_calibration(
-        shared_data("tumvi_imu/kalibr_imucam_chain.yaml"),
-        shared_data("tumvi_imu/kalibr_imu_chain.yaml"),
-    )
-    first = device.cameras[0]
-    assert (first.distortion, first.width_px, first.height_px) == (Distortion.EQUIDISTANT, 512, 512)
-    assert first.distortion_parameters[0] == 0.0034823894022493434
-    T_C_I = se3.inverse(device.T_I_C)
-    p_C_I = [0.04727988224914392, -0.047443232143367084, -0.0681999605066297]
-    np.testing.assert_allclose(T_C_I[0, 4:], p_C_I, atol=1e-12)
-    imu = device.imu
-    assert imu is not None
-    assert (imu.acc_noise_density, imu.gyro_bias_random_walk_noise_density) == (0.0028, 2.2e-5)
-    result = shared_data("tumvi_imu/kalibr_result_512")
-    again = read_calibration(result / "camchain-imucam-imucalib.yaml", result / "imu-imucalib.yaml")
-    np.testing.assert_array_equal(again.T_I_C, device.T_I_C)
 
 
 def _device(*, intrinsics: bool) -> RecordedSensors:
@@ -128,30 +108,6 @@ def test_what_we_export_reads_back(tmp_path: Path, form: str, intrinsics: bool) 
     assert read is not None
     for name in ("T_g", "T_a", "R_A_I"):
         np.testing.assert_allclose(getattr(read, name), getattr(wanted, name), atol=1e-12)
-
-
-def test_upper_triangular_and_rotation() -> None:
-    rng = np.random.default_rng(0)
-    for _ in range(50):
-        matrix = np.eye(3) + rng.normal(size=(3, 3)) * 0.3
-        if np.linalg.det(matrix) <= 0:
-            continue
-        T, R = upper_triangular_and_rotation(matrix)
-        np.testing.assert_allclose(T @ R, matrix, atol=1e-12)
-        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
-        assert np.all(np.diag(T) > 0)
-        assert np.all(np.tril(T, -1) == 0)
-        assert np.linalg.det(R) > 0
-
-
-def test_ids_follow_from_the_calibration(tmp_path: Path) -> None:
-    first, again = _device(intrinsics=True), _device(intrinsics=True)
-    assert (first.imu_id, first.rig_id) == (again.imu_id, again.rig_id)
-    other = _device(intrinsics=False)
-    assert (other.rig_id, other.imu_id != first.imu_id) == (first.rig_id, True)
-    ids = {first.imu_id, first.rig_id, *(camera.id for camera in first.cameras)}
-    assert len(ids) == 4
-    parse_sensors(write_sensors(first.sensors), "text")  # ids and mounts are valid
 
 
 def test_sensors_yaml(tmp_path: Path) -> None:

@@ -125,14 +125,6 @@ def test_stamps_that_simply_follow_pass_as_if_pushed() -> None:
     assert mixed.dropped > 10
 
 
-def test_four_runs() -> None:
-    run = np.arange(40) * 50_000_000
-    stamps = np.concatenate([run, run, run + 10**18, run])
-    kept, left_out = clocks.parts_of(stamps)
-    assert [part.tolist() for part in kept] == np.arange(160).reshape(4, 40).tolist()
-    assert not len(left_out)
-
-
 def four_runs(tmp_path: Path) -> tuple[Path, list[Content]]:
     runs = [shifted(make_content(frames=14), -START_NS + k * SECOND // 10) for k in range(3)]
     runs = [shifted(run, SECOND) for run in runs]

@@ -16,11 +16,7 @@ from maplab_py.interop.recordings import protocol, summary
 from maplab_py.interop.recordings.options import ReadingOptions, SourceOptions, StreamOptions
 from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.recordings.stream import EventStream
-from maplab_py.sensors import Distortion, sensors_yaml
-from maplab_py.simulation.raw_data import write_raw_data
-from maplab_py.simulation.simulate import simulate
 from tests.interop.recordings.written import (
-    INTRINSICS,
     START_NS,
     assert_content,
     assert_in_order,
@@ -30,7 +26,6 @@ from tests.interop.recordings.written import (
     write_calibration,
     write_folder,
 )
-from tests.simulation.small import PERFECT
 from tests.support.data import shared_data
 from tests.support.own_process import in_own_process
 
@@ -99,41 +94,6 @@ def test_missing_images_of_all_cameras_are_listed_and_left_out(tmp_path: Path) -
     assert [note for note in report.notes if "missing, left out" in note] == [
         f"missing, left out: {path}" for path in missing
     ]
-
-
-def test_grey_values_of_any_image(tmp_path: Path) -> None:
-    content = make_content(cameras=1, frames=1, dtype=np.uint16)
-    (deep,) = frame_sets(
-        list(EventStream(open_recording(write_folder(content, tmp_path / "deep"))))
-    )
-    np.testing.assert_array_equal(deep.images[0].grey(), content.images[0][0] >> 8)
-    colours = make_content(cameras=1, frames=1, channels=3)
-    (bright,) = frame_sets(
-        list(EventStream(open_recording(write_folder(colours, tmp_path / "bright"))))
-    )
-    luminance = colours.images[0][0] @ np.array([0.114, 0.587, 0.299])
-    assert np.max(np.abs(bright.images[0].grey() - luminance)) < 1.0
-    assert bright.images[0].grey().dtype == np.uint8
-
-
-def test_sensors_of_a_folder(folder: Path) -> None:
-    device = open_recording(folder).device
-    assert [camera.distortion for camera in device.cameras] == [Distortion.RADTAN] * 2
-    assert device.cameras[0].intrinsics.tolist() == INTRINSICS
-    assert device.imu is not None
-    assert device.imu.gyro_noise_density == 1.6968e-04
-    assert device.T_I_C[:, 4:].tolist() == [[0.0, 0.0, 0.02], [0.1, 0.0, 0.02]]
-    again = open_recording(folder).device
-    assert (again.imu_id, again.rig_id) == (device.imu_id, device.rig_id)
-    assert sensors_yaml.write_sensors(again.sensors) == sensors_yaml.write_sensors(device.sensors)
-
-
-def test_cameras_are_on_the_imu_even_if_it_is_not_the_body(folder: Path) -> None:
-    path = folder / "mav0" / "imu0" / "sensor.yaml"
-    text = path.read_text().replace("[1.0, 0.0, 0.0, 0.0,", "[1.0, 0.0, 0.0, 0.5,")
-    path.write_text(text)
-    T_I_C = open_recording(folder).device.T_I_C
-    np.testing.assert_allclose(T_I_C[:, 4:], [[-0.5, 0.0, 0.02], [-0.4, 0.0, 0.02]], atol=1e-15)
 
 
 def test_some_cameras(folder: Path) -> None:
@@ -271,18 +231,6 @@ DAMAGES = {
         lambda f: [(f / "chain.yaml").touch(), *(p.unlink() for p in f.rglob("sensor.yaml"))],
         r"--sensor_calibration_file.*perhaps one of .*chain\.yaml",
     ),
-    "no camera model": (
-        lambda f: _edit(f / "mav0/cam0/sensor.yaml", "pinhole", "ocam"),
-        r"cam0/sensor\.yaml: key 'camera_model': 'ocam' is not supported",
-    ),
-    "no intrinsics": (
-        lambda f: _edit(f / "mav0/cam0/sensor.yaml", "intrinsics", "intrinsic"),
-        "key 'intrinsics' is missing",
-    ),
-    "no noise": (
-        lambda f: _edit(f / "mav0/imu0/sensor.yaml", "gyroscope_random_walk", "walk"),
-        "key 'gyroscope_random_walk' is missing",
-    ),
 }
 
 
@@ -328,25 +276,6 @@ def test_what_is_no_recording(tmp_path: Path) -> None:
         open_recording(tmp_path / "absent")
     with pytest.raises(UserError, match="is no recording: wants a folder with mav0/cam0"):
         open_recording(tmp_path)
-
-
-def test_simulated_recordings_read_back(tmp_path: Path) -> None:
-    data = simulate(PERFECT)
-    (folder,) = write_raw_data(PERFECT, data, tmp_path)
-    session = data.recordings[0]
-    for home in (folder / "mav0").glob("cam*"):  # the scenario renders no images
-        (home / "data").mkdir()
-        for stamp in session.recording.time_ns.tolist():
-            (home / "data" / f"{stamp}.png").touch()
-    recording = open_recording(folder)
-    events = list(EventStream(recording))
-    times_ns, accel_gyro = samples(events)
-    np.testing.assert_array_equal(times_ns, session.recording.imu_time_ns)
-    np.testing.assert_array_equal(accel_gyro, session.recording.imu.accel_gyro)
-    assert [s.time_ns for s in frame_sets(events)] == session.recording.time_ns.tolist()
-    np.testing.assert_allclose(recording.device.T_I_C, session.device.rig.T_B_C, atol=1e-12)
-    for ours, theirs in zip(recording.device.cameras, session.device.rig.cameras, strict=True):
-        assert ours.intrinsics.tolist() == theirs.intrinsics.tolist()
 
 
 def test_real_stereo_recording() -> None:
