@@ -61,28 +61,6 @@ def test_agrees_with_the_estimators(projection: Projection, distortion: Distorti
     np.testing.assert_allclose(pixels_of(camera, _points()), expected, atol=1e-9)
 
 
-@pytest.mark.parametrize("distortion", [Distortion.NONE, Distortion.RADTAN])
-def test_agrees_with_opencv(distortion: Distortion) -> None:
-    import cv2
-
-    camera = _camera(Projection.PINHOLE, distortion)
-    K = np.array([[380.0, 0, 376], [0, 390, 240], [0, 0, 1]])
-    given = np.array(PARAMETERS[distortion]) if PARAMETERS[distortion] else None
-    expected = cv2.projectPoints(_points(), np.zeros(3), np.zeros(3), K, given)[0][:, 0]
-    np.testing.assert_allclose(pixels_of(camera, _points()), expected, atol=1e-9)
-
-
-def test_agrees_with_opencv_fisheye() -> None:
-    import cv2
-
-    camera = _camera(Projection.PINHOLE, Distortion.EQUIDISTANT)
-    K = np.array([[380.0, 0, 376], [0, 390, 240], [0, 0, 1]])
-    k = np.array(PARAMETERS[Distortion.EQUIDISTANT])
-    points = _points()[:, None]
-    expected = cv2.fisheye.projectPoints(points, np.zeros(3), np.zeros(3), K, k)[0][:, 0]
-    np.testing.assert_allclose(pixels_of(camera, _points()), expected, atol=1e-9)
-
-
 def test_field_of_view_ends_where_the_image_turns_back() -> None:
     folding = np.array([-0.28, 0.0, 0.0, 0.0])
     camera = dataclasses.replace(

@@ -7,18 +7,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import yaml
 
 from maplab_py.console.session.session import Session
-from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
-from maplab_py.interop import imu_csv, trajectories
-from maplab_py.sensors import Camera, Distortion, Projection, projection
+from maplab_py.sensors import Camera, Distortion, Projection
 from maplab_py.simulation import scenario as sim
 from maplab_py.simulation import shading_kernels
 from maplab_py.simulation.cameras import pixels_of
 from maplab_py.simulation.imaging import Brightness, Imager, pixel_rays
-from maplab_py.simulation.raw_data import write_mesh, write_raw_data
+from maplab_py.simulation.raw_data import write_mesh
 from maplab_py.simulation.ray_caster import RayCaster, painted_boxes
 from maplab_py.simulation.scene import Scene, make_scene
 from maplab_py.simulation.simulate import SimulatedData, simulate
@@ -217,31 +214,6 @@ def _image(row: int, time_s: float = 1.0, **changes: float) -> tuple[np.ndarray,
     return _imager(row, **changes).image(time_s, np.random.default_rng(0))
 
 
-@pytest.mark.parametrize(
-    ("distortion", "parameters"),
-    [
-        (Distortion.NONE, []),
-        (Distortion.RADTAN, [-0.28, 0.07, 2e-4, 2e-5]),
-        (Distortion.EQUIDISTANT, [-0.02, 0.01, -0.006, 0.001]),
-        (Distortion.FOV, [0.92]),
-    ],
-)
-def test_rays_of_pixels_meet_their_pixels(distortion: Distortion, parameters: list[float]) -> None:
-    camera = Camera(
-        "0" * 32, Projection.PINHOLE, distortion, np.array([95.0, 95.0, 94.0, 60.0]),
-        np.array(parameters), 188, 120,
-    )  # fmt: skip
-    rays = pixel_rays(camera)
-    seen = np.isfinite(rays[..., 0])
-    assert seen.mean() > 0.95
-    v, u = np.nonzero(seen)
-    points = np.concatenate([rays[seen], np.ones((len(u), 1))], axis=1)
-    np.testing.assert_allclose(pixels_of(camera, points), np.stack([u, v], axis=1), atol=1e-6)
-    expected, valid = projection.back_project(camera, np.stack([u, v], axis=1))
-    turned = np.cross(points, expected)[valid] / np.linalg.norm(points[valid], axis=1)[:, None]
-    assert np.abs(turned).max() < 1e-7
-
-
 @pytest.mark.parametrize("row", [0, 1])
 def test_depth_is_that_of_the_landmarks(row: int) -> None:
     truth, session = data().truth, data().recordings[0]
@@ -282,27 +254,6 @@ def test_both_images_show_the_same_surfaces() -> None:
     assert np.corrcoef(there[visible], left[v, u][inside][visible])[0, 1] > 0.95
 
 
-def test_features_are_found_and_tracked_through_the_images() -> None:
-    one, two = _image(0, 1.0)[0], _image(0, 1.05)[0]
-    corners = cv2.goodFeaturesToTrack(one, 300, 0.02, 6)
-    assert len(corners) > 150
-    moved, status, _ = cv2.calcOpticalFlowPyrLK(one, two, corners, None)
-    assert status.mean() > 0.9
-    session = data().recordings[0]
-    imager = _imager(0)
-    T = imager.at_time(np.array([1.0, 1.05]))
-    depth = _image(0, 1.0)[1]
-    uv = np.round(corners[:, 0]).astype(int)
-    rays = pixel_rays(session.device.true_rig.cameras[0])
-    ray = np.concatenate([rays[uv[:, 1], uv[:, 0]], np.ones((len(uv), 1))], axis=1)
-    p = se3.transform(se3.relative(T[1], T[0]), ray * depth[uv[:, 1], uv[:, 0], None])
-    expected = pixels_of(session.device.true_rig.cameras[0], p) - uv
-    flow = (moved - corners)[:, 0]
-    error = np.linalg.norm(flow - expected, axis=1)[status[:, 0] == 1]
-    assert np.linalg.norm(expected, axis=1).mean() > 1.0
-    assert np.median(error) < 0.3
-
-
 def test_exposure_blur_vignette_and_noise() -> None:
     plain = _image(0)[0].astype(float)
     dark = _image(0, vignette=0.5)[0].astype(float)
@@ -316,47 +267,6 @@ def test_exposure_blur_vignette_and_noise() -> None:
     blurred = _image(0, blur_samples=5, exposure_s=0.05)[0].astype(float)
     sharpness = [np.abs(np.diff(image, axis=1)).mean() for image in (plain, blurred)]
     assert sharpness[1] < 0.9 * sharpness[0]
-
-
-@cache
-def _raw_scenario() -> sim.Scenario:
-    return dataclasses.replace(
-        STEREO,
-        images=sim.ImageOptions(render=True, texel_m=0.02, blur_samples=1),
-        sessions=(dataclasses.replace(STEREO.sessions[0], duration_s=1.0, turns=0.02),),
-    )
-
-
-def test_raw_data_are_euroc_folders(tmp_path: Path) -> None:
-    data = simulate(_raw_scenario())
-    folders = write_raw_data(_raw_scenario(), data, tmp_path)
-    assert folders == [tmp_path / "raw" / "session_1"]
-    mav = folders[0] / "mav0"
-    imu = imu_csv.read_imu_csv(mav / "imu0" / "data.csv")
-    np.testing.assert_array_equal(imu.accel_gyro, data.recordings[0].recording.imu.accel_gyro)
-    for row in (0, 1):
-        lines = (mav / f"cam{row}" / "data.csv").read_text().splitlines()[1:]
-        assert len(lines) == 3
-        stamp, name = lines[1].split(",")
-        image = cv2.imread(str(mav / f"cam{row}" / "data" / name), cv2.IMREAD_UNCHANGED)
-        assert image.shape == (240, 376)
-        assert image.dtype == np.uint8
-        depth_name = tmp_path / "truth" / "session_1" / f"depth{row}" / f"{stamp}.png"
-        depth = cv2.imread(str(depth_name), cv2.IMREAD_UNCHANGED)
-        assert depth.dtype == np.uint16
-        assert 300 < np.median(depth) < 20_000
-        sensor = yaml.safe_load((mav / f"cam{row}" / "sensor.yaml").read_text())
-        assert sensor["distortion_model"] == "radial-tangential"
-        assert sensor["resolution"] == [376, 240]
-        stored = data.recordings[0].device.rig
-        np.testing.assert_allclose(
-            np.array(sensor["T_BS"]["data"]).reshape(4, 4), se3.to_matrix(stored.T_B_C[row])
-        )
-        assert sensor["intrinsics"] == stored.cameras[row].intrinsics.tolist()
-    truth = trajectories.read_trajectory(tmp_path / "truth" / "session_1" / "ground_truth.csv")
-    np.testing.assert_allclose(truth.T_R_B, data.truth.sample_T_G_I)
-    with pytest.raises(UserError, match="exists"):
-        write_raw_data(_raw_scenario(), data, tmp_path)
 
 
 def test_mesh_has_its_normals_in_the_free_space(tmp_path: Path) -> None:

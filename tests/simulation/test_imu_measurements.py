@@ -9,7 +9,7 @@ from maplab_py.estimation.imu.inertial_data import InertialData
 from maplab_py.estimation.imu.preintegration import propagate
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Imu, ImuIntrinsics
-from maplab_py.simulation.imu import ImuRecording, intrinsics_of, measure
+from maplab_py.simulation.imu import intrinsics_of, measure
 from maplab_py.simulation.motion import motion_spline
 from maplab_py.simulation.scenario import ImuOptions, SessionOptions, WorldOptions
 from maplab_py.simulation.simulate import simulate
@@ -89,34 +89,8 @@ def test_correcting_the_reports_gives_force_and_rate() -> None:
     np.testing.assert_allclose(back[:, 3:], motion.w_I, atol=1e-12)
 
 
-def test_ideal_imu_needs_no_intrinsics() -> None:
-    assert intrinsics_of(QUIET) is None
-    skewed = intrinsics_of(SKEWED)
-    assert skewed is not None
-    assert np.all(np.tril(skewed.T_g, -1) == 0.0)
-
-
-def test_biases_walk_as_told() -> None:
-    options = dataclasses.replace(QUIET, accel_bias_walk=0.01, accel_bias_sigma=0.5)
-    motion = _motion(200.0, 60.0)
-    bias = measure(options, IDEAL, motion, np.random.default_rng(2)).accel_bias
-    per_second = bias[200:] - bias[:-200]
-    steps = np.diff(bias, axis=0)
-    assert np.std(steps) == pytest.approx(0.01 / np.sqrt(200.0), rel=0.015)
-    assert np.std(per_second) == pytest.approx(0.01, rel=0.25)
-    assert np.abs(bias[0]).max() > 0.05
-
-
 RATE_HZ = 100.0
-NOISELESS = ImuOptions(
-    rate_hz=RATE_HZ,
-    gyro_noise_density=0.0,
-    accel_noise_density=0.0,
-    gyro_bias_walk=0.0,
-    accel_bias_walk=0.0,
-    gyro_bias_sigma=0.0,
-    accel_bias_sigma=0.0,
-)
+NOISELESS = dataclasses.replace(QUIET, rate_hz=RATE_HZ)
 
 
 def _at_rest(seconds: float, rate_hz: float = RATE_HZ) -> MotionState:
@@ -233,11 +207,3 @@ def test_lost_samples_and_uneven_stamps_leave_a_consistent_map() -> None:
     inside = np.diff(time_ns)[np.diff(time_ns) > 0]
     assert inside.min() > 2_000_000
     assert 50_000 < np.std(inside % 5_000_000) < 3_000_000
-
-
-def test_a_recording_keeps_biases_with_its_samples() -> None:
-    rows = np.array([1, 4, 7])
-    whole = measure(ImuOptions(), IDEAL, _moving(), np.random.default_rng(0))
-    part = whole.take(rows)
-    assert isinstance(part, ImuRecording)
-    np.testing.assert_array_equal(part.gyro_bias, whole.gyro_bias[rows])

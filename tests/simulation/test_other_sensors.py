@@ -109,12 +109,6 @@ def test_too_many_loop_edges_are_refused() -> None:
         simulate(dataclasses.replace(SCENARIO, other_sensors=options))
 
 
-def test_the_scenario_of_false_edges() -> None:
-    data = simulate(scenario_file.load_scenario("false_loop_edges"))
-    assert len(data.truth.loop_edge_is_true) == 60
-    assert data.truth.loop_edge_is_true.sum() == 40
-
-
 def test_raw_data_have_the_velocities_of_the_wheels(tmp_path: Path) -> None:
     options = sim.OtherSensorOptions(
         wheel_odometry=True,

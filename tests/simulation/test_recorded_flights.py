@@ -197,25 +197,3 @@ def test_recorded_samples_of_a_flight_agree_with_its_motion(tmp_path: Path) -> N
     assert np.rad2deg(np.std(felt - turns[:240])) < 0.02
     expected = imu_csv.read_imu_csv(tmp_path / "V101.imu.csv").accel_gyro[: len(rate)]
     np.testing.assert_array_equal(recording.imu.accel_gyro, expected)
-
-
-def test_the_flight_through_the_machine_hall(tmp_path: Path) -> None:
-    data = _example(tmp_path, "machine_hall.yaml", "MH04.gt.csv")
-    speed = np.linalg.norm(data.truth.sample_v_G, axis=1)
-    assert 0.2 < speed.max() < 3.0
-
-
-def test_a_handheld_walk_of_tum_vi() -> None:
-    path = shared_data("tumvi_imu/room4.gt.csv")
-    options = SessionOptions(trajectory=str(path), duration_s=60.0, keep_frame=True)
-    spline = trajectory_spline(options, ROOM, (options,))
-    truth = trajectories.read_trajectory(path)
-    moved = spline.evaluate(np.arange(0.0, 60.0, 0.1)).T_G_I
-    # the pose of the file 30 s later lies within 5 ms of one that the spline meets
-    row = int(np.searchsorted(truth.times_ns, truth.times_ns[0] + 30_000_000_000))
-    expected = se3.relative(truth.T_R_B[0], truth.T_R_B[row])
-    np.testing.assert_allclose(se3.relative(moved[0], moved[300]), expected, atol=0.02)
-    length = np.linalg.norm(np.diff(moved[:, 4:], axis=0), axis=1).sum()
-    assert 30.0 < length < 80.0
-    with pytest.raises(UserError, match="has no biases"):
-        recorded_samples(dataclasses.replace(options, recorded_imu="imu.csv"))

@@ -31,7 +31,6 @@ FLIGHT = sim.Scenario(
     sessions=(sim.SessionOptions(kind="loop", duration_s=1.0, turns=0.03),),
 )
 ROOM = np.array([[-4.0, -3.0, 0.0], [4.0, 3.0, 3.0]])
-FLIGHTS = ("flight_dark", "flight_easy", "flight_fast", "flight_stop_and_go", "turn_on_the_spot")
 
 
 @cache
@@ -83,12 +82,6 @@ def test_both_cameras_have_the_same_gain_at_a_time() -> None:
     brightness = imaging.Brightness(0.5, 0.1, np.array([1.0]), np.array([1.0, 1.2]))
     assert brightness.at(0.5) == pytest.approx(0.5 * (1.0 + 0.1 * np.sin(np.pi / 7.0)))
     assert brightness.at(7.0) == pytest.approx(0.6)
-
-
-def test_without_jumps_the_gain_is_constant() -> None:
-    random = np.random.default_rng(0)
-    brightness = imaging.make_brightness(sim.SessionImages(light=0.7), 0.0, 60.0, random)
-    assert {brightness.at(time) for time in np.linspace(0.0, 60.0, 100)} == {0.7}
 
 
 # -- walkers --------------------------------------------------------------------------------------
@@ -243,17 +236,6 @@ def test_a_written_folder_is_a_recording(tmp_path: Path) -> None:
 # -- scenarios ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", FLIGHTS)
-def test_flights_are_stereo_recordings_at_20_hz(name: str) -> None:
-    assert name in scenario_file.scenario_names()
-    scenario = scenario_file.load_scenario(name)
-    assert scenario.images.render
-    assert len(scenario.cameras) == 2
-    assert scenario.measurement.frame_rate_hz == 20.0
-    baseline = np.subtract(*(camera.position_m for camera in scenario.cameras))
-    assert np.linalg.norm(baseline) == pytest.approx(0.11)
-
-
 def _motion(name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return positions, speeds [m/s] and rates [rad/s] of a scenario at 200 Hz."""
     scenario = scenario_file.load_scenario(name)
@@ -284,12 +266,6 @@ def test_flights_do_what_their_names_say() -> None:
     assert rate[turning].mean() > 0.4
 
 
-def test_the_dark_flight_is_dark() -> None:
-    images = scenario_file.load_scenario("flight_dark").sessions[0].images
-    assert images.light < 0.5
-    assert images.gain_jump > 0.0
-
-
 @pytest.mark.parametrize(
     ("session", "message"),
     [
@@ -307,11 +283,6 @@ def test_mistakes_in_sessions_are_named(session: str, message: str) -> None:
     with pytest.raises(UserError, match=message) as caught:
         scenario_file.parse_scenario(f"sessions: [{{{session}}}]", "mine.yaml")
     assert "\n" not in str(caught.value)
-
-
-def test_bare_share_is_a_share() -> None:
-    with pytest.raises(UserError, match=r"images\.bare_share: must be at least 0 and at most 1"):
-        scenario_file.parse_scenario("images: {bare_share: 2}", "mine.yaml")
 
 
 def test_poses_of_the_states_are_those_of_the_images() -> None:

@@ -17,13 +17,6 @@ def test_named_scenarios_load(name: str) -> None:
     assert scenario.description
 
 
-def test_there_are_the_promised_scenarios() -> None:
-    wanted = {"single_session", "three_sessions", "four_sessions", "aliased_rooms", "ar_room"}
-    wanted |= {"navigation", "degenerate", "large", "false_loop_edges"}
-    wanted |= {"stereo_room", "one_room_many_sessions", "loop_many_sessions"}
-    assert wanted <= set(scenario_names())
-
-
 def test_a_file_overrides_what_it_names(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("name: mine\nimu: {rate_hz: 400}\nsessions: [{kind: loop, turns: 2}]\n")
