@@ -138,18 +138,6 @@ def test_hidden_missions_have_no_label() -> None:
     assert labels["c"] == ("start c", "")
 
 
-def test_ends_without_labels_stay_without() -> None:
-    many = build_scene(Subject(walk_map()))
-    dots = {
-        key: dataclasses.replace(part, labels=())
-        for key, part in many.layer(PATH_ENDS).parts.items()
-    }  # type: ignore[call-arg]
-    bare = dataclasses.replace(
-        many, layers=(dataclasses.replace(many.layer(PATH_ENDS), parts=dots),)
-    )
-    assert set(_labels(with_end_labels(bare, set(dots))).values()) == {()}
-
-
 def test_missions_of_one_robot_have_one_colour_if_that_is_wanted() -> None:
     first, second = simulated().maps
     three, _ = merge_maps(merge_maps(first, second)[0], first, assign_new_ids=True)

@@ -128,35 +128,6 @@ def test_checkboxes_toggle_layers(page: Page, viewer: Viewer) -> None:
     assert page.wait_until(lambda: colour_count(page.picture(), pale, 12) > 0.8 * many)
 
 
-def _purple(picture: np.ndarray) -> int:
-    """Return how many pixels are of a purple surface, whatever light falls on it."""
-    red, green, blue = np.moveaxis(picture.astype(int), 2, 0)
-    return int(np.count_nonzero((red > green + 30) & (blue > green + 30)))
-
-
-def _green(picture: np.ndarray) -> int:
-    """Return how many pixels are of a green surface, whatever light falls on it."""
-    red, green, blue = np.moveaxis(picture.astype(int), 2, 0)
-    return int(np.count_nonzero((green > red + 30) & (green > blue + 30)))
-
-
-def test_a_mesh_is_on_the_canvas_in_its_colours(page: Page, viewer: Viewer) -> None:
-    middle = MAP.T_G_I[:, 4:].mean(axis=0)
-    corners = np.array([[-2.0, -2.0, 0.0], [2.0, -2.0, 0.0], [2.0, 2.0, 0.0], [-2.0, 2.0, 0.0]])
-    faces = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
-    colour = np.tile(np.array([200, 30, 200], dtype=np.uint8), (4, 1))
-    before = _purple(page.still_picture())
-    colour[2:] = (30, 200, 30)
-    green = _green(page.picture())
-    mesh = Cloud("Surface", corners + middle, colour, faces=faces)
-    viewer.show(dataclasses.replace(SUBJECT, clouds=(mesh,)))
-    assert page.wait_until(lambda: _purple(page.picture()) > before + 500)
-    assert page.wait_until(lambda: _green(page.picture()) > green + 500)
-    page.click(page.checkbox("Surface 2"))
-    assert page.wait_until(lambda: _purple(page.picture()) < before + 200)
-    assert page.errors == []
-
-
 def test_a_click_picks_the_vertex_under_it(page: Page, viewer: Viewer) -> None:
     row = 7
     viewer.set_layer("loop_closures", False)
@@ -167,17 +138,6 @@ def test_a_click_picks_the_vertex_under_it(page: Page, viewer: Viewer) -> None:
     assert (picked.entity, picked.row) == (Entity.VERTEX, row)
     assert page.wait_until(lambda: page.page.get_by_text(f"{row + 1} of 14").count() == 1)
     assert page.wait_until(lambda: colour_count(page.picture(), colours.PICKED, 70) > 50)
-
-
-def test_a_click_picks_the_landmark_under_it(page: Page, viewer: Viewer) -> None:
-    viewer.set_layer("loop_closures", False)
-    viewer.set_layer("vertices", False)
-    row = int(np.argmin(np.linalg.norm(MAP.p_G - MAP.p_G.mean(axis=0), axis=1)))
-    page.page.mouse.click(*place_on_page(viewer, MAP.p_G[row]))
-    assert page.wait_until(lambda: viewer.selection.picked is not None)
-    picked = viewer.selection.picked
-    assert picked is not None
-    assert (picked.entity, picked.row) == (Entity.LANDMARK, row)
 
 
 def test_two_picks_measure_a_distance(page: Page, viewer: Viewer) -> None:

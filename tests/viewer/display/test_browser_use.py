@@ -4,7 +4,6 @@ import dataclasses
 import os
 import signal
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -34,7 +33,6 @@ from maplab_py.viewer.picking import Pick
 from maplab_py.viewer.scene import Entity
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import random_ids
-from tests.support.machine import slowness
 from tests.support.waiting import wait_until
 from tests.viewer.display.browsing import IN_BROWSER, Page, chromium, colour_count, is_blank
 from tests.vimap.builders import walk_map
@@ -302,24 +300,6 @@ def test_pictures_are_saved_with_and_without_a_page(browser: Any, tmp_path: Path
     shown = cv2.imread(str(tmp_path / "page.jpg"))
     assert shown is not None
     assert shown.shape == (300, 400, 3)
-    viewer.stop()
-
-
-def test_many_pages_do_no_harm(browser: Any) -> None:
-    viewer = Viewer(0)
-    viewer.show(SUBJECT)
-    pages = [Page(browser, viewer.url, (240, 160), frame_ms=1500) for _ in range(4)]
-    assert pages[0].wait_until(lambda: viewer.pages == 4)
-    viewer.set_layer("imu_edges", True)
-    for opened in pages[:3]:
-        opened.page.close()
-    assert pages[3].wait_until(lambda: viewer.pages == 1)
-    began = time.perf_counter()
-    viewer.follow(SUBJECT.replace(vi_map=MAP.replace()))
-    assert viewer.wait(10.0)
-    assert time.perf_counter() - began < 5.0 * slowness()
-    assert pages[3].errors == []
-    pages[3].page.close()
     viewer.stop()
 
 

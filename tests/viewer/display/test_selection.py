@@ -114,13 +114,3 @@ def test_a_page_that_closes_while_the_map_is_replaced_is_left_out(viewer: Viewer
     viewer.selections.show_image(np.zeros((8, 8, 3), dtype=np.uint8))
     viewer.show(Subject(MAP.replace(), "walk"))
     assert viewer.selection.picked is None
-
-
-def test_ten_pages_come_and_go(viewer: Viewer) -> None:
-    for _ in range(10):
-        with open_page(viewer) as connection:
-            page = OpenPage(viewer, connection)
-            page.click(viewer, 7)
-            page.wait_for_text("8 of 14")
-    assert wait_until(lambda: viewer.pages == 0, 20.0)
-    assert wait_until(lambda: not viewer.selections.pages, 20.0)

@@ -231,10 +231,6 @@ def test_an_export_has_all_layers_and_leaves_the_page_as_it_was(
     assert ".maplab-swipe {" in text  # its script draws the swipe line
 
 
-def _properties(control: Message) -> Message:
-    return {**control, **control.get("props", {})}
-
-
 def test_colouring_changes_the_legend(viewer: Viewer) -> None:
     viewer.set_colouring("height")
     assert viewer.wait(10.0)
@@ -404,32 +400,6 @@ def test_live_updates_wait_for_a_page(viewer: Viewer, two_missions: VIMap) -> No
 
     assert viewer.pages == 0
     assert not viewer.follow_live(never)
-
-
-def test_pages_may_come_and_go(viewer: Viewer, two_missions: VIMap) -> None:
-    protocol = f"viser-v{viser.__version__}"
-    url = viewer.url.replace("http", "ws", 1)
-    stop = threading.Event()
-
-    def visit() -> None:
-        while not stop.is_set():
-            with connect(url, subprotocols=[protocol], close_timeout=0.1) as connection:
-                connection.recv(timeout=5.0)
-                connection.socket.shutdown(socket.SHUT_RDWR)  # as a killed browser does
-
-    visitors = [threading.Thread(target=visit) for _ in range(5)]
-    for visitor in visitors:
-        visitor.start()
-    for step in range(10):
-        viewer.follow(Subject(_moved(two_missions, 0.1 * step), "test"))
-        viewer.set_layer("imu_edges", step % 2 == 0)
-        assert viewer.wait(10.0)
-    stop.set()
-    for visitor in visitors:
-        visitor.join(timeout=20.0)
-    assert viewer.wait(10.0)
-    with connect(url, subprotocols=[protocol]) as connection:
-        assert connection.recv(timeout=5.0)
 
 
 def test_ten_pages_and_one_that_comes_back_show_the_map_of_now(viewer: Viewer) -> None:

@@ -19,7 +19,6 @@ from maplab_py.viewer import colours
 from maplab_py.viewer.building import Subject, build_scene
 from maplab_py.viewer.drawing import make_drawing
 from maplab_py.viewer.facts import facts
-from maplab_py.viewer.layers import covariances
 from maplab_py.viewer.layers.closures import ACCEPTED, REFUSED
 from maplab_py.viewer.layers.clouds import Cloud
 from maplab_py.viewer.layers.covariances import ABSOLUTE_POSES, LOOP_CLOSURES, ellipsoids
@@ -30,7 +29,6 @@ from maplab_py.viewer.scene import (
     WHOLE_MAP,
     Entity,
     Layer,
-    LegendEntry,
     Mesh,
     Points,
     Scene,
@@ -205,19 +203,6 @@ def test_intensity_has_no_unit() -> None:
     assert float(entry.high) > 240.0
 
 
-def test_own_colours_need_no_legend() -> None:
-    own = np.full((200, 3), 80, dtype=np.uint8)
-    assert _scene(Cloud("photo", _line(0.0, 1.0), own)).layer("cloud_0").legend == ()
-
-
-def test_a_mesh_in_one_colour_has_a_swatch() -> None:
-    faces = np.array([[0, 1, 2]], dtype=np.int32)
-    layer = _scene(Cloud("mesh", _line(0.0, 1.0), faces=faces)).layer("mesh_0")
-    mesh = layer.parts[""]
-    assert isinstance(mesh, Mesh)
-    assert layer.legend == (LegendEntry("mesh", (colours.to_hex(mesh.colours),)),)
-
-
 def _both(vi_map: VIMap, other: VIMap) -> tuple[Scene, Segments, Points]:
     scene = build_scene(
         Subject(vi_map, "after", other=other, other_name="snapshot 'before'", arrangement="beside")
@@ -369,15 +354,6 @@ def test_layers_are_there_only_when_asked_for() -> None:
     assert layer.total == len(vi_map.loop_closure_edges)
     with pytest.raises(FlagError, match="--vis_covariance_scale=0: must be above 0"):
         VisualizationOptions(covariance_scale=0.0)
-
-
-def test_of_very_many_only_some_are_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(covariances, "_MAX_ELLIPSOIDS", 1)
-    vi_map = with_covariances(np.random.default_rng(5))
-    options = VisualizationOptions(lc_edge_covariances=True)
-    layer = build_scene(Subject(vi_map, options=options)).layer(LOOP_CLOSURES)
-    assert layer.title == "Loop closure covariances (one of 2)"
-    assert layer.drawn == 72
 
 
 def test_tubes_widen_from_where_the_path_is_held() -> None:
