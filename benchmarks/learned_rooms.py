@@ -32,14 +32,26 @@ from maplab_py.simulation import raw_data, scenario_file
 from maplab_py.simulation.scenario import Scenario, SessionImages
 from maplab_py.simulation.truth import Truth, true_map
 from maplab_py.storage.native import load_map
-from maplab_py.vimap import VIMap
+from maplab_py.vimap import VIMap, table
 from maplab_py.vimap.merge import merge_maps
 from maplab_py.vision.features.extractors import KINDS
-from tests.algorithms.image_features.test_rendered_loops import without_features
 
 _DUSK = SessionImages(light=0.25, gain_jump=0.3, gain_jump_every_s=2.0, repainted_share=0.3)
 _NIGHT = SessionImages(light=0.12, gain_jump=0.5, gain_jump_every_s=1.0, repainted_share=0.4)
 _RIGHT_M, _RIGHT_DEG, _WRONG_M, _WRONG_DEG = 0.25, 2.0, 0.5, 5.0
+
+
+def _without_features(vi_map: VIMap) -> VIMap:
+    """Return the map without the keypoints that the simulator made."""
+    frames = vi_map.frames
+    return vi_map.replace(
+        frames=frames.replace(
+            keypoint_count=np.zeros(len(frames), dtype=np.int32),
+            descriptor_blocks=table.object_column([None] * len(frames)),
+        ),
+        keypoints=vi_map.keypoints.take(np.zeros(0, dtype=np.int64)),
+        landmarks=vi_map.landmarks.take(np.zeros(0, dtype=np.int64)),
+    )
 
 
 def _scenario() -> Scenario:
@@ -108,7 +120,7 @@ def main() -> None:
     sessions = []
     for name in ("session_1", "session_2", "session_3"):
         vi_map, _ = import_images(load_map(folder / name)[0], 0, folder / "raw" / name)
-        sessions.append(without_features(true_map(vi_map, truth)))
+        sessions.append(_without_features(true_map(vi_map, truth)))
     for features in ("xfeat", "sift", "brisk", "orb"):
         day, dusk, night = (_described(session, features) for session in sessions)
         vi_map = _mapped(day, features)

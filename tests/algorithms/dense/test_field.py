@@ -2,12 +2,10 @@
 
 import dataclasses
 
-import numba
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.ndimage import distance_transform_edt
 
 from maplab_py.algorithms.dense.field import (
     DistanceField,
@@ -78,18 +76,6 @@ def test_points_of_the_surface_have_none() -> None:
     weights = np.random.default_rng(2).dirichlet([1.0, 1.0, 1.0], len(faces))
     points = np.einsum("fk,fki->fi", weights, p[faces])
     np.testing.assert_allclose(TriangleTree(p, faces).distances(points), 0.0, atol=1e-7)
-
-
-def test_threads_give_the_same_bytes() -> None:
-    before = numba.get_num_threads()
-    p, faces = triangles(300, 5)
-    points = np.random.default_rng(5).normal(size=(3000, 3))
-    results = []
-    for threads in (1, before):
-        numba.set_num_threads(threads)
-        results.append(TriangleTree(p, faces).distances(points).tobytes())
-    numba.set_num_threads(before)
-    assert results[0] == results[1]
 
 
 def test_nothing_and_too_much_are_refused() -> None:
@@ -169,25 +155,6 @@ def test_the_field_is_that_of_the_mesh() -> None:
     np.testing.assert_allclose(
         np.abs(field.distance_m[known]), np.minimum(expected, LIMIT_M), atol=1e-6
     )
-
-
-def test_scipy_agrees_up_to_the_size_of_a_voxel() -> None:
-    """scipy measures to the nearest voxel behind the surface, which is at most a diagonal behind it."""
-    blocks, radius = cube_of_blocks(-2, 2), 0.75
-    truth = np.linalg.norm(voxel_centres(blocks.astype(np.int32), VOXEL_M), axis=-1) - radius
-    field = field_of(grid_of(truth, blocks), dataclasses.replace(OPTIONS, max_distance_m=9.0))
-    side = 32
-    volume = np.full((side, side, side), np.nan)
-    for block, distance in zip(field.coordinates + 2, field.distance_m, strict=True):
-        a, b, c = (8 * block).tolist()
-        volume[a : a + 8, b : b + 8, c : c + 8] = distance
-    is_free = volume > 0.0
-    inside = np.linalg.norm(np.argwhere(np.isnan(volume)) - 15.5, axis=1)
-    assert (inside * VOXEL_M < radius).all()
-    behind = distance_transform_edt(is_free, sampling=VOXEL_M)
-    difference = (behind - volume)[is_free]
-    assert difference.min() > 0.0
-    assert difference.max() < np.sqrt(3.0) * VOXEL_M
 
 
 def test_the_unseen_is_unknown_and_the_unconfirmed_is_not_behind() -> None:

@@ -278,22 +278,6 @@ def test_a_sphere_is_watertight_and_looks_outwards() -> None:
     assert euler == 2
 
 
-def test_a_plane_is_where_it_is() -> None:
-    grid = TsdfGrid(SETTINGS)
-    normal, offset = np.array([0.1, -0.2, 1.0]), 2.0
-    depth = (offset / (PINHOLE.rays() @ normal)).astype(np.float32)
-    grid.allocate(depth, PINHOLE, np.eye(4))
-    grid.integrate(depth, PINHOLE, np.eye(4))
-    mesh = grid.mesh(0.1)
-    distance = (mesh.p @ normal - offset) / np.linalg.norm(normal)
-    assert len(mesh.p) > 1000
-    # distances along the optical axis are flatter than the normal; the zero crossing is the same
-    assert np.abs(distance).max() < 0.1 * SETTINGS.voxel_size_m
-    corners = mesh.p[mesh.faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    assert (normals @ normal < 0.0).all(), "the free side of the plane is the camera's"
-
-
 def test_no_triangle_touches_an_unobserved_cell() -> None:
     grid = sphere_grid()
     min_weight = 0.5

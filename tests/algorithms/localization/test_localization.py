@@ -68,11 +68,6 @@ def database(kind: str):
     return database_of_summary(make_summary_map(vi_map, SummaryMapOptions()))
 
 
-def test_the_map_is_where_it_really_is():
-    vi_map, _, truth, _ = sessions()
-    np.testing.assert_allclose(vi_map.T_G_I[:, 4:], truth[:, 4:], atol=1e-6)
-
-
 @pytest.mark.parametrize("kind", ["full", "summary"])
 def test_queries_are_found_where_they_were(kind):
     _, query, _, truth = sessions()
@@ -177,38 +172,6 @@ def near(kind, one, T_G_I):
         radius_rad=12.0 * one.rad_per_px,
         max_distance=0.34 * 384 if kind == "full" else 52.0,
     )
-
-
-@pytest.mark.parametrize("kind", ["full", "summary"])
-def test_a_pose_suggests_matches_near_the_images_of_landmarks(kind):
-    _, query, _, truth = sessions()
-    source = localization.query_vertices(query, np.array([0]), database(kind).projection)
-    off_px = []
-    for row, one in enumerate(localization.queries(source)):
-        keypoint, landmark = near(kind, one, truth[row])
-        assert np.all(np.diff(keypoint) >= 0)
-        assert len(set(zip(keypoint.tolist(), landmark.tolist(), strict=True))) == len(keypoint)
-        point_I = se3.transform(se3.inverse(truth[row]), database(kind).p_G[landmark])
-        toward = point_I - one.origin_I[keypoint]
-        toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-        angle = np.linalg.norm(np.cross(toward, one.ray_I[keypoint]), axis=1)
-        off_px.append(angle / one.rad_per_px[keypoint])
-        assert off_px[-1].max() < 12.0 * 1.01
-        assert len(keypoint) >= OPTIONS.min_inlier_count
-    # wrong ones would spread over the disc, a quarter of them within half of its radius
-    assert np.mean(np.concatenate(off_px) < 6.0) > 0.75
-
-
-def test_a_wrong_pose_suggests_next_to_nothing():
-    _, query, _, truth = sessions()
-    source = localization.query_vertices(query, np.array([0]), database("summary").projection)
-    turned = se3.make(so3.exp([0.0, 0.0, 1.5]), np.zeros(3))
-    for row, one in enumerate(localization.queries(source)):
-        wrong = se3.compose(truth[row], turned)
-        right = near("summary", one, truth[row])[0]
-        assert len(near("summary", one, wrong)[0]) < 0.1 * len(right)
-    far = se3.make(so3.identity(), [1e3, 0.0, 0.0])
-    assert len(near("summary", one, far)[0]) == 0
 
 
 def test_a_landmark_is_looked_for_from_where_it_was_seen():

@@ -335,9 +335,3 @@ def test_two_landmarks_of_one_image_are_two_points():
     united = unite(vi_map, votes((a, b, 5), (a, b, 6)), 2)
     assert len(united.vote) == 0
     assert united.seen_together == 1
-
-
-def test_no_votes_unite_nothing():
-    vi_map, _ = make_map(THREE[:1])
-    united = unite(vi_map, votes(), 2)
-    assert len(united.first) == united.too_few == united.seen_together == 0

@@ -54,11 +54,6 @@ def closed():
     return vi_map, *close_loops(vi_map)
 
 
-def original_landmarks(vi_map, before):
-    """The landmark id that every keypoint observes."""
-    return vi_map.landmarks.id[vi_map.keypoints.landmark]
-
-
 def test_every_candidate_is_recorded_with_its_verdict(closed):
     _, merged, report = closed
     record = read_record(merged)
@@ -349,11 +344,6 @@ def moved(flags: tuple[str, ...]) -> LoopClosureOptions:
     pairs = [flag.removeprefix("--lc_").split("=") for flag in flags]
     values = {name: type(getattr(OPTIONS, name))(float(value)) for name, value in pairs}
     return dataclasses.replace(OPTIONS, **values)
-
-
-@pytest.mark.slow
-def test_moving_the_named_flags_accepts_closures_of_a_real_map() -> None:
-    assert_that_named_flags_accept(euroc(), closures=2)
 
 
 def euroc() -> VIMap:

@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.loop_closure.workflow import close_loops, find_loop_closures, search_loops
-from maplab_py.algorithms.relaxation.options import RelaxationOptions
-from maplab_py.algorithms.relaxation.relaxation import relax
+from maplab_py.algorithms.loop_closure.workflow import find_loop_closures, search_loops
 from maplab_py.geometry import se3, so3
 from maplab_py.vimap import VIMap
 from tests.algorithms.loop_closure.against_truth import score, sessions
@@ -19,27 +17,6 @@ pytestmark = pytest.mark.slow
 def load(relative: str) -> VIMap:
     native = pytest.importorskip("maplab_py.storage.native")
     return native.load_map(shared_data(f"maplab_maps/{relative}"))[0]
-
-
-def test_the_one_loop_of_the_handheld_walk_is_found_relaxed_and_merged():
-    vi_map = load("tango_handheld")
-    edges, report = find_loop_closures(vi_map)
-    assert report.accepted_vertices >= 100
-    seconds = (vi_map.vertices.timestamp_ns - vi_map.vertices.timestamp_ns[0]) * 1e-9
-    first = np.minimum(seconds[edges.from_vertex], seconds[edges.to_vertex])
-    last = np.maximum(seconds[edges.from_vertex], seconds[edges.to_vertex])
-    assert first.max() < 12.0
-    assert last.min() > 100.0
-
-    _, refused = close_loops(vi_map)
-    assert "run relax first" in refused.failure
-
-    relaxed, _ = relax(vi_map, RelaxationOptions(), loop_closures=edges)
-    merged, closed = close_loops(relaxed)
-    assert closed.median_correction_m < 0.05
-    assert closed.landmarks_merged > 200
-    kept = np.count_nonzero(merged.keypoints.landmark >= 0)
-    assert kept == np.count_nonzero(relaxed.keypoints.landmark >= 0)
 
 
 def test_closures_of_the_flight_agree_with_ground_truth():

@@ -258,13 +258,6 @@ def test_the_oldest_results_are_dropped(descriptors: DescriptorSet, counted: _Co
     assert counted.built == 1
 
 
-def test_a_result_larger_than_the_memory_is_returned(descriptors: DescriptorSet) -> None:
-    memory = SearchMemory(max_bytes=8)
-    rows = _search(memory, descriptors, descriptors, [ANY])[0]
-    assert rows.shape == (len(descriptors), 2)
-    assert len(memory) == 0
-
-
 TWICE = [
     Walk(room=1, vertices=24),
     Walk(room=1, vertices=24, start_s=60.0, drift=(0.02, -0.01, 0.01, 0.002)),
@@ -330,13 +323,6 @@ def test_other_descriptors_are_not_matched():
     other = vi_map.replace(keypoints=vi_map.keypoints.replace(descriptor=noise))
     empty = guided_matches(other, closures, closures.accepted, LoopClosureOptions())
     assert len(empty.keypoint) == 0
-
-
-def test_no_closures_give_no_matches():
-    vi_map = single_tracks()
-    closures = search_loops(vi_map)[0].closures
-    nothing = np.zeros(len(closures), dtype=np.bool_)
-    assert len(guided_matches(vi_map, closures, nothing, LoopClosureOptions()).keypoint) == 0
 
 
 @pytest.mark.parametrize("kept", [4, 6])

@@ -45,12 +45,6 @@ def test_objective_and_optimum_are_those_of_gtsam(name):
     np.testing.assert_array_equal(result.weight, 1.0)
 
 
-@pytest.mark.parametrize(("name", "optimum"), [("parking-garage", 1.263), ("smallGrid3D", 1025.4)])
-def test_optimum_is_near_the_certified_one(name, optimum):
-    result = optimize_graph(read_g2o(shared_data(f"g2o/{name}.g2o")), PLAIN)
-    assert result.cost_after == pytest.approx(optimum, rel=0.02)
-
-
 def test_planar_graph_stays_in_its_plane():
     graph = read_g2o(shared_data("g2o/intel.g2o"))
     result = optimize_graph(graph, PLAIN)
@@ -180,24 +174,6 @@ def test_losses_hold_false_edges_off(robustness):
     assert robust.weight[is_false].max() < 0.1
     assert np.median(robust.weight[~is_false]) > 0.5
     assert _rms(robust.T_G_V, clean) < 0.25  # the edges' own noise is 0.1 m and 0.2 rad
-
-
-def test_closures_that_nothing_contradicts_cost_no_more_than_the_plain_solution():
-    graph = torus(1000, 20, seed=5)
-    plain = optimize_graph(graph, PLAIN)
-    robust = optimize_graph(graph, RelaxationOptions(num_iterations=100))
-    assert robust.cost_after == pytest.approx(plain.cost_after, rel=1e-6)
-    np.testing.assert_array_equal(robust.weight, 1.0)
-    assert robust.iterations <= plain.iterations + 3
-
-
-def test_a_false_closure_of_a_torus_is_switched_off():
-    graph = torus(1000, 20, seed=6)
-    measured = graph.T_A_B.copy()
-    measured[1500, 4:] += 3.0
-    wrong = dataclasses.replace(graph, T_A_B=measured)
-    robust = optimize_graph(wrong, RelaxationOptions(num_iterations=100))
-    assert np.flatnonzero(robust.weight < 0.5).tolist() == [1500]
 
 
 def test_poses_that_only_contradicting_closures_hold_do_not_end_the_relaxation():

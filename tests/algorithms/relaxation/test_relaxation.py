@@ -2,21 +2,17 @@
 
 import dataclasses
 
-import numba
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from threadpoolctl import threadpool_limits
 
 from maplab_py.algorithms.relaxation import map_edges
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.relaxation import move_vertices, relax, relax_graph
 from maplab_py.algorithms.relaxation.robust import independent_errors, variance_factor, with_tail
-from maplab_py.errors import Cancelled
 from maplab_py.estimation.problem.gauge import clusters
 from maplab_py.estimation.symbolic.sources import PoseError
 from maplab_py.geometry import se3, so3
-from maplab_py.progress import SilentProgress
 from maplab_py.simulation import evaluation, scenario_file
 from maplab_py.simulation.simulate import simulate as simulate_scenario
 from maplab_py.vimap import Landmarks, LoopClosureEdges, random_ids, to_hex
@@ -78,22 +74,6 @@ def test_false_edges_of_the_scenario(seed):
     assert told["num_switched_off"] == 20
     assert 0.0 < told["mean_correction_m"] < told["max_correction_m"]
     assert 0.0 < told["mean_correction_deg"] < told["max_correction_deg"]
-
-
-@pytest.mark.parametrize("robustness", ["switchable", "cauchy"])
-def test_other_robust_weightings_hold_too(robustness):
-    loop = simulate(1, false_share=0.3)
-    options = RelaxationOptions(robustness=robustness)
-    relaxed, report = relax(loop.vi_map, options, loop_closures=loop.closures)
-    raw = ate(loop.vi_map.T_G_I, loop.T_G_I)
-    assert ate(relaxed.T_G_I, loop.T_G_I) < 0.5 * raw
-    assert report.num_switched_off >= len(loop.closures) - loop.num_true
-
-
-def test_false_closures_do_harm_without_robustness():
-    loop = simulate(1, false_share=0.3)
-    raw = ate(loop.vi_map.T_G_I, loop.T_G_I)
-    assert _relaxed_error(loop, loop.closures, RelaxationOptions(robustness="none")) > raw
 
 
 def test_missions_are_pulled_together_and_one_vertex_stays():
@@ -164,15 +144,6 @@ def test_without_closures_the_map_stays_and_the_report_fails():
     assert "unknown base frame" in report.failure
 
 
-def test_closures_of_the_map_count_and_stay():
-    loop = simulate(0, false_share=0.0)
-    vi_map = loop.vi_map.replace(loop_closure_edges=loop.closures)
-    relaxed, report = relax(vi_map, OPTIONS)
-    assert report.num_loop_closures == 80
-    assert len(relaxed.loop_closure_edges) == 80
-    assert ate(relaxed.T_G_I, loop.T_G_I) < 0.6 * ate(vi_map.T_G_I, loop.T_G_I)
-
-
 def test_velocities_turn_and_landmarks_follow():
     vi_map = simulate(0).vi_map
     landmarks = Landmarks.filled(2, vertex=[3, 400], p_I=[[1.0, 2, 3], [4, 5, 6]])
@@ -186,29 +157,6 @@ def test_velocities_turn_and_landmarks_follow():
     )
     np.testing.assert_allclose(moved.p_G[1], se3.transform(turn, vi_map.p_G[1]), atol=1e-12)
     np.testing.assert_array_equal(moved.p_G[0], vi_map.p_G[0])
-
-
-@pytest.mark.parametrize("robustness", ["gnc", "dcs"])
-def test_same_bits_twice_on_any_number_of_threads(robustness):
-    loop, options = simulate(3, missions=2), RelaxationOptions(robustness=robustness)
-    results = []
-    for threads in (1, 2, 2):
-        with threadpool_limits(threads):
-            numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
-            relaxed, _ = relax(loop.vi_map, options, loop_closures=loop.closures)
-        results.append(relaxed.vertices.T_M_I.tobytes() + relaxed.baseframes.T_G_M.tobytes())
-    numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
-    assert results[0] == results[1] == results[2]
-
-
-def test_cancelling_leaves_by_the_exception():
-    class Impatient(SilentProgress):
-        def check(self) -> None:
-            raise Cancelled("stop")
-
-    loop = simulate(3)
-    with pytest.raises(Cancelled):
-        relax(loop.vi_map, OPTIONS, loop_closures=loop.closures, progress=Impatient())
 
 
 def raised(T_A_B: np.ndarray, T_G_A: np.ndarray, height_m: float) -> np.ndarray:

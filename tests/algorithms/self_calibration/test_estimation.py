@@ -8,7 +8,6 @@ import pytest
 from maplab_py.algorithms.self_calibration import calibration as module
 from maplab_py.algorithms.self_calibration.calibration import (
     calibrate,
-    describe_partitions,
     partitions_without_scale,
 )
 from maplab_py.algorithms.self_calibration.estimation.imu_interpolation import (
@@ -20,20 +19,14 @@ from maplab_py.algorithms.self_calibration.estimation.problem import (
     parallax_rad,
 )
 from maplab_py.algorithms.self_calibration.estimation.solution import reject_tracks_chi2, solve
-from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
 from maplab_py.algorithms.self_calibration.segments.selection import collect
 from maplab_py.algorithms.self_calibration.segments.splitting import extract_submap
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.estimation.states import States
-from maplab_py.simulation.scenario import MotionOptions, SessionOptions
-from maplab_py.simulation.scenario_file import load_scenario
-from maplab_py.simulation.simulate import simulate
-from maplab_py.simulation.truth import true_map
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.edits import with_p_G
 from maplab_py.vimap.table import ragged_rows
 from tests.algorithms.self_calibration.scenes import EXACT, OPTIONS, scene_map, uncalibrated
-from tests.support.noiseless import without_noise
 
 
 def with_signal(vi_map: VIMap, hertz: float) -> tuple[VIMap, np.ndarray]:
@@ -82,38 +75,6 @@ def test_copies_of_a_sample_between_edges_stay_equal() -> None:
     follows = vi_map.imu_edges.to_vertex[:-1] == vi_map.imu_edges.from_vertex[1:]
     assert follows.any()
     np.testing.assert_array_equal(values[start[1:-1] - 1][follows], values[start[1:-1]][follows])
-
-
-@pytest.mark.slow
-def test_a_shaken_imu_keeps_its_scale() -> None:
-    """Perfect measurements at 100 Hz: what is left is the error of the integration."""
-    scenario = load_scenario("ar_room")
-    motion = MotionOptions(
-        kind="figure_8",
-        duration_s=10.0,
-        turns=0.3,
-        wall_distance_m=2.6,
-        shake_m=0.06,
-        shake_rad=0.2,
-    )
-    perfect = dataclasses.replace(
-        without_noise(scenario),
-        calibration=scenario.calibration,
-        sessions=(SessionOptions(phases=(motion,)),),
-    )
-    data = simulate(perfect)
-    true = true_map(data.maps[0], data.truth)
-    errors = []
-    for curvature in (False, True):
-        options = SelfCalibrationOptions(
-            keep_unobservable_at_prior=True, imu_curvature=curvature, loss="none"
-        )
-        blocks = build_segment_problem(true, options, robust=False).states.blocks
-        result, _ = calibrate(true, options)
-        error = result.parameters.difference(result.blocks, blocks)
-        errors.append(np.abs(error[:3]).max())  # scales of the gyroscope
-    assert errors[0] > 2e-4
-    assert errors[1] < 0.25 * errors[0]
 
 
 def jumping(vi_map: VIMap, landmarks: np.ndarray, jump_px: float) -> VIMap:
@@ -225,12 +186,6 @@ def test_nothing_is_returned_when_too_little_is_left(monkeypatch: pytest.MonkeyP
     few = dataclasses.replace(OPTIONS, min_shared_landmarks=10**6)
     with pytest.raises(EstimationError, match=r"not excited.*without mission .*lengths are lost"):
         calibrate(start, few)
-
-
-def test_names_of_runs() -> None:
-    problem = build_segment_problem(extract_submap(scene_map(vertices=61), ROWS), APART)
-    (name,) = describe_partitions(problem, np.array([0]))
-    assert name.endswith("0.0 to 5.8 s")
 
 
 def test_parallax_does_not_grow_where_landmarks_are_estimated_too_near() -> None:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 from functools import cache
 from pathlib import Path
 
@@ -225,23 +224,6 @@ def test_a_file_with_the_columns_of_before_is_read(tmp_path: Path) -> None:
     assert load_database(old).records == database.records
     save_database(load_database(old), tmp_path / "again.segments")
     assert (tmp_path / "again.segments").read_bytes() == path.read_bytes()
-
-
-def test_a_save_that_fails_leaves_the_old_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / "device.segments"
-    save_database(collected(), path)
-    before = path.read_bytes()
-
-    def full(*_: object, **__: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(UserError, match="No space left"):
-        save_database(collected(), path)
-    assert path.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_damaged_foreign_and_newer_files_are_refused(tmp_path: Path) -> None:

@@ -139,11 +139,3 @@ def test_loop_edges_hold_the_map_and_wrong_ones_do_no_harm(wrong: int, seed: int
     assert "loop closure" in [term.term for term in report.terms]
     assert pose_errors(result).max() <= 0.005
     assert share_within(result, 0.01) >= 0.95
-
-
-@pytest.mark.slow
-def test_flags_without_measurements_change_nothing() -> None:
-    plain, _ = recovered(reference(), 0)
-    flags = {"include_absolute_pose_constraints": True, "include_loop_closure_edges": True}
-    same, _ = recovered(reference(), 0, **flags)
-    np.testing.assert_array_equal(same.vertices.T_M_I, plain.vertices.T_M_I)

@@ -3,7 +3,6 @@
 import dataclasses
 import time
 
-import numba
 import numpy as np
 import pytest
 
@@ -11,7 +10,6 @@ from maplab_py.algorithms.vi_optimization import linear_solver
 from maplab_py.algorithms.vi_optimization.map_problem import build
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
-from maplab_py.algorithms.vi_optimization.reports import VIOptimizationReport
 from maplab_py.errors import Cancelled, EstimationError, FlagError, MaplabError, UserError
 from maplab_py.estimation.linear import supernodal_solver
 from maplab_py.estimation.problem.iterative import IterativeProblem
@@ -67,15 +65,6 @@ def test_cancelling_between_iterations_leaves_the_map_untouched(cancel_at: int, 
     iterations = [line for line in watcher.lines if not line.startswith("compiling")]
     assert len(iterations) == (0 if hide else cancel_at - 1)
     assert contents(vi_map) == before
-
-
-def test_one_line_per_iteration() -> None:
-    watcher = Watcher()
-    _, report = optimize(start(), dataclasses.replace(OPTIONS, num_iterations=4), progress=watcher)
-    assert report.iterations == 4
-    assert report.termination == "iteration limit"
-    assert len(watcher.lines) == 4
-    assert all("\n" not in line and "cost" in line for line in watcher.lines)
 
 
 def test_no_time_means_no_iteration() -> None:
@@ -170,22 +159,6 @@ def test_map_without_usable_measurements_is_one_clear_error() -> None:
         optimize(empty, options)
 
 
-def test_any_number_of_threads_gives_the_same_bytes() -> None:
-    if numba.config.NUMBA_NUM_THREADS < 2:
-        pytest.skip("one processor only")
-    results: list[tuple[VIMap, VIOptimizationReport]] = []
-    before = numba.get_num_threads()
-    try:
-        for threads in (1, 2, numba.config.NUMBA_NUM_THREADS):
-            numba.set_num_threads(threads)
-            results.append(optimize(start(), dataclasses.replace(OPTIONS, num_iterations=8)))
-    finally:
-        numba.set_num_threads(before)
-    for result, report in results[1:]:
-        assert contents(result) == contents(results[0][0])
-        assert report.cost_after == results[0][1].cost_after
-
-
 SESSIONS = Scene(missions=2, vertices=12, landmarks=200, noise=1.0)
 
 
@@ -222,18 +195,6 @@ def built(**flags: object) -> tuple[bool, list[str]]:
 def test_small_maps_stay_direct_without_a_word() -> None:
     assert built() == (False, [])
     assert built(linear_solver_type="multifrontal") == (False, [])
-
-
-def test_conjugate_gradients_on_request_give_the_same_map() -> None:
-    common = {"num_iterations": 40, "function_tolerance": 1e-10}
-    reports = {
-        name: optimize(sessions(), VIOptimizationOptions(linear_solver_type=name, **common))[1]  # type: ignore[arg-type]
-        for name in ("multifrontal", "pcg")
-    }
-    for name, report in reports.items():
-        assert report.linear_solver == name
-        assert (report.linear_iterations > 0) == (name == "pcg")
-        assert report.cost_after == pytest.approx(reports["multifrontal"].cost_after, rel=1e-8)
 
 
 def test_many_pairs_of_observations_decide_without_an_analysis(

@@ -304,14 +304,6 @@ def test_missions_that_are_not_named_stay_to_the_last_bit(mission: int) -> None:
         assert np.abs(after[~other] - before[~other]).max() > 1e-5
 
 
-def test_base_frames_measurements_and_sensors_stay() -> None:
-    result, _ = optimize(start(), OPTIONS)
-    assert result.baseframes is start().baseframes
-    assert result.keypoints is start().keypoints
-    assert result.imu_samples is start().imu_samples
-    assert result.sensors is start().sensors
-
-
 def test_base_frames_that_nothing_could_move_are_refused() -> None:
     options = dataclasses.replace(
         OPTIONS, fix_vertices=True, absolute_pose_sensor_fix_mission_baseframes=False

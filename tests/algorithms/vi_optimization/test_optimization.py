@@ -11,7 +11,6 @@ from maplab_py.algorithms.vi_optimization.data_selection import LeftOut, select,
 from maplab_py.algorithms.vi_optimization.local import optimize_around
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import DataOptions, VIOptimizationOptions
-from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3
 from maplab_py.simulation import evaluation, scenario_file
 from maplab_py.simulation.simulate import SimulatedData, simulate
@@ -42,16 +41,6 @@ def test_errors_against_truth_fall() -> None:
     assert consistency.check_consistency(result).failure == ""
 
 
-def test_only_position_and_heading_of_one_vertex_are_fixed() -> None:
-    result, report = optimize(session(), OPTIONS)
-    assert report.gauge == "position and heading of 1 cluster"
-    first = session().T_G_I[0], result.T_G_I[0]
-    np.testing.assert_array_equal(first[0][4:], first[1][4:])
-    turned = so3.log(so3.multiply(first[1][:4], so3.inverse(first[0][:4])))
-    assert abs(turned[2]) <= 1e-4
-    assert np.linalg.norm(turned[:2]) > abs(turned[2])
-
-
 def test_the_optimum_does_not_depend_on_where_the_map_lies() -> None:
     options = dataclasses.replace(OPTIONS, num_iterations=60, function_tolerance=1e-10)
     here = optimize(session(), options)[1]
@@ -61,51 +50,11 @@ def test_the_optimum_does_not_depend_on_where_the_map_lies() -> None:
     assert there.cost_after == pytest.approx(here.cost_after, rel=1e-4)
 
 
-def test_input_is_untouched_and_runs_are_identical() -> None:
-    before = session().vertices.T_M_I.copy()
-    one, two = (optimize(session(), OPTIONS)[0] for _ in range(2))
-    np.testing.assert_array_equal(session().vertices.T_M_I, before)
-    np.testing.assert_array_equal(one.vertices.T_M_I, two.vertices.T_M_I)
-    np.testing.assert_array_equal(one.landmarks.p_I, two.landmarks.p_I)
-
-
-def test_blind_vertices_and_missing_imu_edges_are_no_obstacle() -> None:
-    blind = np.flatnonzero(np.isin(session().keypoint_vertex, [5, 6, 40]))
-    observing = blind[session().keypoints.landmark[blind] >= 0]
-    vi_map = remove_observations(session(), observing)
-    result, report = optimize(vi_map, OPTIONS)
-    assert report.vertices_held == 0  # inertial edges carry them
-    assert np.isfinite(result.vertices.T_M_I).all()
-    visual = dataclasses.replace(OPTIONS, include_inertial=False, num_iterations=10)
-    result, report = optimize(vi_map, visual)
-    assert report.vertices_held == 3
-    held = result.vertices.T_M_I[5], vi_map.vertices.T_M_I[5]
-    np.testing.assert_allclose(*held, atol=1e-12)
-
-
 @pytest.mark.parametrize("loss", ["none", "huber", "cauchy", "tukey", "geman_mcclure", "dcs"])
 def test_every_loss_lowers_its_cost(loss: str) -> None:
     options = dataclasses.replace(OPTIONS, loss=loss, num_iterations=10)
     report = optimize(session(), options)[1]
     assert report.cost_after < report.cost_before
-
-
-def test_nothing_to_optimise_is_said() -> None:
-    with pytest.raises(EstimationError, match="nothing to optimise"):
-        optimize(VIMap(), OPTIONS)
-
-
-def test_failed_factorisations_are_named_by_the_map() -> None:
-    from maplab_py.algorithms.vi_optimization.map_problem import build
-    from maplab_py.algorithms.vi_optimization.report_building import make_report
-    from maplab_py.estimation.problem.solver import SolverSummary
-    from maplab_py.estimation.states import NODES_PER_VERTEX, VELOCITY
-    from maplab_py.vimap.ids import to_hex
-
-    posed = build(session(), OPTIONS)
-    summary = SolverSummary({}, {}, 3, 1, "", 0.0, (3 * NODES_PER_VERTEX + VELOCITY,))
-    report = make_report(posed, posed.states, summary)
-    assert report.singular_at == [f"velocity of {to_hex(session().vertices.id[3])}"]
 
 
 EIGHT_STEPS = VIOptimizationOptions(num_iterations=8, hide_iterations_console_output=True)
@@ -175,13 +124,6 @@ def shared_with(vi_map: VIMap, keypoints: np.ndarray) -> np.ndarray:
     return np.count_nonzero(shared, axis=1)
 
 
-def test_nothing_is_left_out_without_limits():
-    vi_map = walk_map()
-    kept, left_out = thinned(vi_map, vi_map.observations, DataOptions())
-    np.testing.assert_array_equal(kept, vi_map.observations)
-    assert left_out == LeftOut()
-
-
 @pytest.mark.parametrize("limit", [2, 5, 8])
 def test_every_landmark_keeps_as_many_observations_as_allowed(limit):
     vi_map = walk_map()
@@ -229,17 +171,6 @@ def test_no_vertex_shares_landmarks_with_more_vertices_than_allowed(limit):
     assert 0 < shared_with(vi_map, kept).max() <= limit
     assert left_out.not_covisible == len(vi_map.observations) - len(kept) > 0
     assert left_out.over_limit == 0
-
-
-def test_both_limits_hold_together_and_the_counts_add_up():
-    vi_map = walk_map()
-    options = DataOptions(max_observations_per_landmark=3, max_covisible_frames=6)
-    kept, left_out = thinned(vi_map, vi_map.observations, options)
-    assert counts(vi_map, kept).max() <= 3
-    assert shared_with(vi_map, kept).max() <= 6
-    assert left_out.over_limit + left_out.not_covisible == len(vi_map.observations) - len(kept)
-    again, _ = thinned(vi_map, vi_map.observations, options)
-    np.testing.assert_array_equal(again, kept)
 
 
 def test_landmarks_at_a_camera_and_maps_without_observations_are_taken():

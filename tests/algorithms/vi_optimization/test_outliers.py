@@ -142,30 +142,6 @@ def test_landmarks_of_other_missions_have_their_own_threshold() -> None:
     np.testing.assert_array_equal(data.loss_scale, np.where(mission == home, 1.5, 7.0))
 
 
-@pytest.mark.slow
-def test_the_threshold_between_missions_decides_how_far_wrong_matches_pull() -> None:
-    truth = Scene(missions=2, vertices=8, noise=1.0).make()
-    landmark = truth.keypoints.landmark
-    own = truth.vertices.mission[truth.keypoint_vertex]
-    home = truth.vertices.mission[truth.landmarks.vertex[landmark]]
-    crossing = np.flatnonzero((landmark >= 0) & (own != home))[::3]
-    uv = truth.keypoints.uv_px.copy()
-    uv[crossing] += [15.0, 0.0]
-    wrong = truth.replace(keypoints=truth.keypoints.replace(uv_px=uv))
-    pulls = []
-    for scale in (1.0, 20.0):
-        options = dataclasses.replace(
-            TIGHT,
-            loss="huber",
-            use_visual_outlier_rejection_solver=False,
-            loss_scale_other_mission=scale,
-        )
-        result, undisturbed = optimize(wrong, options)[0], optimize(truth, options)[0]
-        shift = result.T_G_I[8:, 4:] - undisturbed.T_G_I[8:, 4:]
-        pulls.append(float(np.linalg.norm(shift, axis=1).mean()))
-    assert pulls[0] < 0.5 * pulls[1]
-
-
 NO_LOSS = VIOptimizationOptions(
     num_iterations=30,
     loss="none",
@@ -193,22 +169,3 @@ def test_visual_inertial(seed: int) -> None:
     total, freedom, _ = chi_square(scene.make())
     assert freedom > 5000  # one standard deviation is below 0.02
     assert 0.95 <= total / freedom <= 1.05
-
-
-@pytest.mark.parametrize("seed", [1, 2])
-def test_inertial_terms_by_themselves_at_the_truth(seed: int) -> None:
-    """The trapezoid of shared samples has 1 - 1 / 2n of the variance of n independent steps."""
-    scene = Scene(vertices=400, interval_s=0.2, landmarks=3, noise=1.0, seed=seed)
-    options = VIOptimizationOptions(include_visual=False, num_iterations=0)
-    _, report = optimize(scene.make(), options)
-    parts = {term.term: (2.0 * term.cost_before, term.count) for term in report.terms}
-    assert parts["bias walk"][0] / (6 * parts["bias walk"][1]) == pytest.approx(1.0, abs=0.06)
-    assert parts["inertial"][0] / (9 * parts["inertial"][1]) == pytest.approx(1.0, abs=0.06)
-
-
-def test_weights_that_are_wrong_show() -> None:
-    vi_map = Scene(vertices=20, landmarks=400, noise=1.0).make()
-    keypoints = vi_map.keypoints
-    wrong = keypoints.replace(sigma_px=2.0 * np.asarray(keypoints.sigma_px))
-    total, freedom, _ = chi_square(vi_map.replace(keypoints=wrong))
-    assert total / freedom < 0.5

@@ -8,10 +8,9 @@ from numpy.typing import NDArray
 
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
-from maplab_py.estimation.imu import inertial_data, preintegration
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors import CameraRig, Distortion, ImuIntrinsics, Projection
-from maplab_py.vimap import VIMap, consistency
+from maplab_py.vimap import VIMap
 from tests.support.scene import EVERY_MODEL, Scene, aligned, corrupted
 
 EXACT = VIOptimizationOptions(
@@ -54,27 +53,6 @@ def disturbed(vi_map: VIMap, seed: int = 7) -> VIMap:
         gyro_bias=2e-3,
         accel_bias=0.02,
     )
-
-
-@pytest.mark.parametrize("name", SCENES)
-def test_samples_fit_the_discrete_integration(name: str) -> None:
-    truth = SCENES[name].make()
-    assert consistency.check_consistency(truth).failure == ""
-    data, edges = inertial_data.InertialData.of_map(truth), truth.imu_edges
-    v_G = so3.rotate(truth.T_G_M[truth.vertices.mission, :4], truth.vertices.v_M)
-    first = edges.from_vertex
-    poses, velocities = preintegration.propagate(
-        data,
-        truth.T_G_I[first],
-        v_G[first],
-        truth.vertices.gyro_bias[first],
-        truth.vertices.accel_bias[first],
-        [0.0, 0.0, -SCENES[name].gravity_mps2],
-    )
-    last = data.sample_start[1:] - 1
-    error = se3.local(truth.T_G_I[edges.to_vertex], poses[last])
-    np.testing.assert_allclose(error, 0.0, atol=1e-13)
-    np.testing.assert_allclose(velocities[last], v_G[edges.to_vertex], atol=1e-13)
 
 
 @pytest.mark.parametrize(
