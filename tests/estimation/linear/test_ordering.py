@@ -110,18 +110,6 @@ def test_work_of_groups_is_that_of_their_nodes() -> None:
     assert graph.work(order, 1) == pytest.approx(by_nodes, rel=0.05)
 
 
-def test_the_adjacency_has_no_diagonal_and_no_duplicates() -> None:
-    graph = quotient_graph.QuotientGraph.of(_pattern("random"))
-    start, neighbours = graph.adjacency()
-    edges = {
-        (row, int(col))
-        for row in range(len(graph))
-        for col in neighbours[start[row] : start[row + 1]]
-    }
-    assert len(edges) == len(neighbours) == 2 * len(graph.rows)
-    assert all(a != b and (b, a) in edges for a, b in edges)
-
-
 @needs_metis
 def test_overlapping_sessions_take_a_fraction_of_the_work() -> None:
     pattern, _ = _sessions_on_a_loop(10, 300)

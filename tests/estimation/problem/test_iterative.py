@@ -282,19 +282,6 @@ def test_thirty_problems_against_the_cholesky_factor_of_the_same_matrix(seed: in
     assert energy[0] < 0.0
 
 
-def test_the_optimum_is_that_of_the_direct_solver() -> None:
-    dense = problem_of(missions=2, vertices=10, landmarks=150, loss=Loss.CAUCHY)
-    direct, iterative = both(dense, IterativeOptions())
-    options = SolverOptions(num_iterations=50, function_tolerance=1e-10)
-    costs = []
-    for problem in (direct, iterative):
-        problem.fix(np.array([0, 1]))
-        _, summary = optimize_states(problem, dense.states, options, SILENT)
-        costs.append(sum(summary.final_costs.values()))
-    assert costs[1] == pytest.approx(costs[0], rel=1e-8)
-    assert iterative.linear_solver == "pcg"
-
-
 def test_the_step_that_ends_a_run_is_solved_again_more_exactly() -> None:
     dense = problem_of(missions=2)
     _, iterative = both(dense, IterativeOptions())

@@ -168,17 +168,6 @@ def test_inertial_optimum_is_that_of_gtsam() -> None:
     assert np.abs(ours.accel_bias - theirs.accel_bias).max() <= 1e-4
 
 
-@pytest.mark.slow
-def test_costs_agree_on_a_larger_problem_too() -> None:
-    pytest.importorskip("pycolmap", "4.2", reason=NO_PEER)
-    from benchmarks import ceres_solver
-
-    problem, rule = make_visual("small"), StoppingRule(function_tolerance=1e-9)
-    ours, _ = maplab_solver.solve_visual(problem, rule)
-    theirs, _ = ceres_solver.solve_visual(problem, rule)
-    assert relative(ours.cost, theirs.cost) <= 1e-8
-
-
 def test_ceres_schedule_goes_the_way_of_ceres() -> None:
     """With the same schedule and damping the costs of each iteration are the same, too.
 

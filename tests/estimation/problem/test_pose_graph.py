@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from maplab_py.estimation.codegen.kernels import pose_graph_kernels
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.problem.gauge import clusters
 from maplab_py.estimation.problem.pose_graph import PoseGraphProblem
@@ -154,17 +153,6 @@ def test_poses_without_an_active_edge_do_not_make_the_others_singular():
     step = problem.try_step(T, problem.linearize(T, 0.0), 1e-8)
     np.testing.assert_allclose(step.states[3], T[3], atol=1e-12)
     assert problem.cost(step.states) < problem.cost(T)
-
-
-def test_steps_are_exponentials():
-    rng = np.random.default_rng(1)
-    T, step = _poses(rng, 3), rng.normal(size=(3, 6))
-    step[1] *= 1e-9
-    kernels = pose_graph_kernels(PoseError.SPLIT)
-    moved = kernels.moved(T, np.array([0, 2, 1]), step)
-    expected = se3.compose(T[[0, 2, 1]], se3.exp(step))[[0, 2, 1]]
-    np.testing.assert_allclose(so3.to_matrix(moved[:, :4]), so3.to_matrix(expected[:, :4]))
-    np.testing.assert_allclose(moved[:, 4:], expected[:, 4:])
 
 
 def test_uncertainty_of_closures_is_that_of_the_inverse():

@@ -309,21 +309,6 @@ def test_switched_relative_poses(rng: np.random.Generator) -> None:
     check(term, at)
 
 
-def test_an_open_switch_is_the_relative_pose_itself(rng: np.random.Generator) -> None:
-    at = states(rng).with_blocks(switch_block(np.ones(1)))
-    measured, W = se3.identity(1), np.eye(6)[None]
-    ends = np.array([0]), np.array([2])
-    switched = SwitchedRelativePoseTerm(
-        residual_kernel("switched_relative_pose", sources.switched_relative_pose),
-        "loop", *ends, measured, W, np.array([0]), at.nodes(SWITCH),
-    )  # fmt: skip
-    plain = RelativePoseTerm(
-        residual_kernel("relative_pose", sources.relative_pose),
-        "loop", *ends, se3.identity(1), measured, W,
-    )  # fmt: skip
-    np.testing.assert_allclose(switched.evaluate(at)[0], plain.evaluate(at)[0], atol=1e-12)
-
-
 @pytest.mark.parametrize("manifold", list(blocks.Manifold))
 def test_priors_of_blocks(rng: np.random.Generator, manifold: blocks.Manifold) -> None:
     tangent = rng.normal(0, 0.8, (3, 6))
@@ -347,15 +332,6 @@ def test_priors_of_vertices(rng: np.random.Generator) -> None:
     check(PosePrior(rows, near, rng.normal(size=(2, 6, 6))), at)
     for kind in (VELOCITY, GYRO_BIAS, ACCEL_BIAS):
         check(VertexVectorPrior(kind, rows, rng.normal(size=(2, 3)), 0.3), at)
-
-
-def test_a_prior_at_the_state_costs_nothing(rng: np.random.Generator) -> None:
-    at = states(rng)
-    residual = PosePrior(np.array([1]), at.T_G_I[[1]], np.eye(6)).evaluate(at)[0]
-    np.testing.assert_allclose(residual, 0.0, atol=1e-12)
-    moved = dataclasses.replace(at, v_G=at.v_G + np.array([0.0, 0.0, 3.0]))
-    prior = VertexVectorPrior(VELOCITY, np.array([0]), at.v_G[[0]], 1.5)
-    np.testing.assert_allclose(prior.evaluate(moved)[0], [[0.0, 0.0, 2.0]])
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-9, 1e-7, 1e-5, 1e-3, 0.5, 2.0])
@@ -383,38 +359,6 @@ def test_inertial_jacobian(scale: float) -> None:
     zero = np.concatenate([T_A, v_A, np.full(3, 0.01), np.full(3, 0.02), T_B, v_B, fixed])
     jacobian = evaluate(kernel, zero, 9, 24)[1]
     assert_relative(jacobian, differences(residual, 24))
-
-
-@pytest.mark.parametrize("with_mounting", [False, True])
-@pytest.mark.parametrize("scale", [0.9, 1.0, 1.02])
-def test_scaled_relative_pose_jacobian(scale: float, with_mounting: bool) -> None:
-    from maplab_py.estimation.symbolic.residuals import relative_pose as unscaled
-    from maplab_py.estimation.symbolic.residuals import scaled_relative_pose
-
-    T_A = se3.make(so3.exp([0.3, -0.2, 0.8]), [1.0, 2.0, 3.0])
-    T_B = se3.make(so3.exp([0.1, 0.5, 0.7]), [1.5, 2.2, 2.9])
-    T_I_S = se3.make(so3.exp([0.2, 0.1, -0.4]), [0.1, 0.2, -0.1])
-    measured = se3.make(so3.exp([0.02, -0.1, 0.3]), [0.5, 0.1, -0.05])
-    function = scaled_relative_pose(with_mounting=with_mounting)
-
-    def residual(delta: np.ndarray) -> np.ndarray:
-        A, B = se3.retract(T_A, delta[:6]), se3.retract(T_B, delta[6:12])
-        S = se3.retract(T_I_S, delta[12:18]) if with_mounting else T_I_S
-        T = se3.relative(se3.compose(A, S), se3.compose(B, S))
-        turn = so3.log(so3.multiply(so3.inverse(measured[:4]), T[:4]))
-        return np.concatenate([(scale + delta[-3]) * T[4:] - measured[4:], turn])
-
-    size = 21 if with_mounting else 15
-    value, jacobian = (
-        np.asarray(part)
-        for part in function(T_A, T_B, T_I_S, measured, np.array([scale, 0.0, 0.0]))
-    )
-    assert jacobian.shape == (6, size)
-    np.testing.assert_allclose(value[:, 0], residual(np.zeros(size)), atol=1e-12)
-    assert_relative(jacobian, differences(residual, size))
-    if scale == 1.0:
-        same = np.asarray(unscaled()(T_A, T_B, T_I_S, measured)[0])
-        np.testing.assert_allclose(value, same, atol=1e-14)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-7, 1e-5, 1e-3, 0.4, 3.0])
