@@ -94,10 +94,6 @@ _FILES = {
     "listing with files misspelt": Damage(
         replaced(_LISTING, "files", "filez"), _LISTING, ("filez",)
     ),
-    "listing with path misspelt": Damage(replaced(_LISTING, "path", "pahh"), _LISTING, ("pahh",)),
-    "listing with file_type misspelt": Damage(
-        replaced(_LISTING, "file_type", "file_typ"), _LISTING, ("file_typ",)
-    ),
     "listing with an unknown type": Damage(
         replaced(_LISTING, "file_type: 3", "file_type: 9"), _LISTING, ("file_type",)
     ),
@@ -203,18 +199,13 @@ _VERTICES, _EDGES, _MISSIONS = (
 _FRAME = ("frame ",)
 _FIELDS = {
     "T_M_I with NaN": Damage(vertex(put("T_M_I", 4, NAN)), _VERTICES, ("T_M_I",)),
-    "T_M_I infinite": Damage(vertex(put("T_M_I", 5, float("inf"))), _VERTICES, ("T_M_I",)),
     "T_M_I with a zero quaternion": Damage(
         vertex(lambda v: [put("T_M_I", k, 0.0)(v) for k in range(4)]),
         _VERTICES,
         ("T_M_I", "length 0"),
     ),
-    "T_M_I with a long quaternion": Damage(vertex(put("T_M_I", 0, 3.0)), _VERTICES, ("T_M_I",)),
     "T_M_I short": Damage(vertex(lambda v: v.T_M_I.pop()), _VERTICES, ("T_M_I", "6 numbers")),
-    "T_M_I absent": Damage(vertex(clear("T_M_I")), _VERTICES, ("T_M_I", "0 numbers")),
     "v_M with NaN": Damage(vertex(put("v_M", 0, NAN)), _VERTICES, ("v_M",)),
-    "v_M short": Damage(vertex(lambda v: v.v_M.pop()), _VERTICES, ("v_M",)),
-    "accel_bias with NaN": Damage(vertex(put("accel_bias", 0, NAN)), _VERTICES, ("accel_bias",)),
     "gyro_bias long": Damage(vertex(lambda v: v.gyro_bias.append(0)), _VERTICES, ("gyro_bias",)),
     "vertex without mission": Damage(vertex(clear("mission_id")), _VERTICES, ("no mission",)),
     "vertex of another mission": Damage(
@@ -236,9 +227,6 @@ _FIELDS = {
     ),
     "fewer vertices than ids": Damage(
         vertices(lambda m: m.vertices.pop()), "vi_map/vertices1", ("9 vertices", "10 vertex_ids")
-    ),
-    "fewer vertex ids than vertices": Damage(
-        vertices(lambda m: m.vertex_ids.pop()), "vi_map/vertices1", ("9 vertex_ids",)
     ),
     "edges in a file of vertices": Damage(
         vertices(lambda m: m.edge_ids.add()), "vi_map/vertices1", ("holds edge_ids",)
@@ -311,11 +299,7 @@ _FIELDS = {
         _VERTICES,
         (*_FRAME, "--repair"),
     ),
-    "frame id of one word": Damage(frame(lambda f: f.id.words.pop()), _VERTICES, ("1 words",)),
     "landmark with NaN": Damage(landmark(put("p_I", 0, NAN)), _VERTICES, ("landmark ", "position")),
-    "landmark position short": Damage(
-        landmark(lambda lm: lm.p_I.pop()), _VERTICES, ("landmark ", "position")
-    ),
     "landmark covariance short": Damage(
         landmark(lambda lm: lm.covariance.extend([1.0] * 5)), _VERTICES, ("landmark ", "covariance")
     ),
@@ -354,11 +338,6 @@ _FIELDS = {
         "",
         ("times do not increase",),
     ),
-    "imu stamps that stand still": Damage(
-        imu(lambda e: put("timestamps_ns", 2, e.timestamps_ns[1])(e)),
-        "",
-        ("times do not increase",),
-    ),
     "imu edge to nowhere": Damage(
         imu(lambda e: other_id(e, "to_vertex_id")), _EDGES, ("to-vertex", "not in")
     ),
@@ -372,7 +351,6 @@ _FIELDS = {
         edges(lambda m: (m.edges.pop(), m.edge_ids.pop())), "vi_map/vertices", ("not in the map",)
     ),
     "odometry with NaN": Damage(odometry(put("T_A_B", 6, NAN)), _EDGES, ("T_A_B",)),
-    "odometry short": Damage(odometry(lambda e: e.T_A_B.pop()), _EDGES, ("T_A_B", "6 numbers")),
     "odometry covariance short": Damage(
         odometry(lambda e: e.covariance.pop()), _EDGES, ("T_A_B_covariance", "35")
     ),
@@ -380,9 +358,6 @@ _FIELDS = {
         redirected(61, "odometry", back_to_the_vertex_before), "", ("circle",)
     ),
     "loop closure with NaN": Damage(loop(put("T_A_B", 0, NAN)), _EDGES, ("T_A_B",)),
-    "loop closure with a zero quaternion": Damage(
-        loop(lambda e: [put("T_A_B", k, 0.0)(e) for k in range(4)]), _EDGES, ("T_A_B", "length 0")
-    ),
     "loop closure with a switch of NaN": Damage(
         loop(lambda e: setattr(e, "switch_variable", NAN)), "", ("switch_variable",)
     ),
@@ -407,9 +382,6 @@ _FIELDS = {
     "mission with another imu": Damage(
         mission(lambda m: other_id(m, "imu_id")), "", ("imu is not in sensors.yaml",), is_note=True
     ),
-    "mission with a long imu id": Damage(
-        mission(extra_word("imu_id")), _MISSIONS, ("imu_id", "3 words")
-    ),
     "mission resources of different length": Damage(
         mission(lambda m: m.resource_types.append(1)), _MISSIONS, ("resource_types",)
     ),
@@ -427,9 +399,6 @@ _FIELDS = {
     ),
     "base frame with NaN": Damage(
         baseframe(put("T_G_M", 4, NAN)), _MISSIONS, ("base frame ", "T_G_M")
-    ),
-    "base frame short": Damage(
-        baseframe(lambda b: b.T_G_M.pop()), _MISSIONS, ("base frame ", "T_G_M")
     ),
     "base frame covariance short": Damage(
         baseframe(lambda b: b.T_G_M_covariance.extend([1.0])), _MISSIONS, ("T_G_M_covariance",)

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from maplab_py.atomic import files as atomic_files
 from maplab_py.cancellation import CancelToken, obeying
 from maplab_py.console.session.session import Session
 from maplab_py.errors import Cancelled, MapError, UserError
@@ -16,7 +15,7 @@ from maplab_py.storage.native import load_map, save_map
 from maplab_py.storage.resources import files as resource_files
 from maplab_py.storage.resources import store as resource_store
 from maplab_py.storage.resources.new import NewResources
-from maplab_py.storage.resources.types import RESOURCE_TYPES, resource_type, resource_type_of
+from maplab_py.storage.resources.types import RESOURCE_TYPES, resource_type_of
 from maplab_py.vimap import ResourceOwner, Resources, VIMap, consistency, edits, merge, random_ids
 from maplab_py.vimap.queries import resource_missions, resources_of, without_resources
 from tests.simulation.small import simulated
@@ -221,13 +220,6 @@ def contents(vi_map: VIMap, folder: Path) -> list[bytes]:
     return [resource_store.resource_path(vi_map, row, folder).read_bytes() for row in range(COUNT)]
 
 
-def test_there_are_the_formats_types() -> None:
-    assert len(RESOURCE_TYPES) == 25
-    assert resource_type(18).suffix == ".tsdf.voxblox"
-    with pytest.raises(MapError, match="25"):
-        resource_type(25)
-
-
 def test_store_loads_and_stays_within_its_bound(folder: Path) -> None:
     vi_map, _ = load_map(folder)
     assert sorted(vi_map.resources.type) == [0, 11, 11, 11]
@@ -403,22 +395,6 @@ def test_new_resources_go_to_the_external_folder_in_use(
 
 def failing(*_: object) -> None:
     raise UserError("stopped")
-
-
-def test_a_full_disk_is_one_line_with_remedy(
-    temporary: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    new = NewResources(temporary)
-
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(atomic_files.PendingFile, "complete", full)
-    with pytest.raises(UserError, match=r"No space left on device.*TMPDIR") as error:
-        new.add_image(IMAGES[0])
-    assert "\n" not in str(error.value)
-    assert len(new) == 0
-    assert [path for path in temporary.rglob("*") if path.is_file()] == []
 
 
 def test_a_missing_temporary_folder_is_refused(tmp_path: Path) -> None:
