@@ -1,6 +1,5 @@
 """The program without a terminal: scripts, streams, statuses, start-up time."""
 
-import json
 import os
 import signal
 import subprocess
@@ -50,13 +49,6 @@ def test_scripts_flag_files_and_standard_input(tmp_path: Path) -> None:
     assert "--repetitions  4      f:1" in done.stdout
     done = run_program(tmp_path, text="flags\nexit\nnosuch\n")
     assert (done.returncode, done.stdout) == (0, "all flags have their defaults\n")
-
-
-def test_json_is_one_object_per_command(tmp_path: Path) -> None:
-    done = run_program(tmp_path, "--json", "-c", "create_new_map a; list")
-    lines = [json.loads(line) for line in done.stdout.splitlines()]
-    assert [line["command"] for line in lines] == ["create_new_map", "list"]
-    assert lines[1]["report"]["maps"][0]["map_key"] == "a"
 
 
 def test_errors_and_tracebacks_go_to_the_log(tmp_path: Path) -> None:
@@ -123,14 +115,6 @@ def test_start_up_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         peers.append(libraries_start_s())
     assert min(starts) <= 1.25 * min(peers)
     assert min(refusals) <= 0.75 * min(peers)  # imports nothing but the plugins of its commands
-
-
-def test_an_error_is_an_object_with_json(tmp_path: Path) -> None:
-    done = run_program(tmp_path, "--json", "-c", "list; map_stats")
-    assert done.returncode == 2
-    lines = [json.loads(line) for line in done.stdout.splitlines()]
-    assert [line["status"] for line in lines] == [0, 2]
-    assert "no map is selected" in lines[1]["error"]
 
 
 def test_a_script_with_variables_comments_and_jobs(tmp_path: Path) -> None:

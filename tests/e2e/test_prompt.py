@@ -44,13 +44,6 @@ def test_tab_completes_commands_flags_and_values(console: Console, tmp_path: Pat
     console.wait_for(lambda _: console.last_line.endswith("--file=folder_of_maps/"))
 
 
-def test_tab_shows_flags_with_type_and_default(console: Console) -> None:
-    console.type("watch --" + TAB)
-    screen = console.wait_for_text("--repetitions=")
-    assert "float = 2" in screen
-    assert "--map_folder" not in screen
-
-
 def test_an_unknown_command_is_red_while_it_is_typed(console: Console) -> None:
     console.type("hel")
     console.wait_for(lambda _: console.last_line.endswith("hel"))
@@ -129,12 +122,6 @@ def test_the_prompt_comes_soon(tmp_path: Path) -> None:
         console.close()
         peers.append(libraries_start_s())
     assert min(starts[1:]) <= 1.25 * min(peers[1:])
-
-
-def test_the_toolbar_shows_the_selected_map(console: Console) -> None:
-    console.enter("create_new_map euroc")
-    screen = console.wait_for_text("map euroc · 0 missions")
-    assert screen.splitlines()[-1].startswith("map euroc")
 
 
 def test_the_shell_is_one_mark_away(console: Console, tmp_path: Path) -> None:

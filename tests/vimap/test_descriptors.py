@@ -10,12 +10,8 @@ from maplab_py.algorithms.keyframing.heuristic import keyframe
 from maplab_py.algorithms.keyframing.options import KeyframingOptions
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
 from maplab_py.algorithms.landmarks.tracks import init_tracks
-from maplab_py.algorithms.loop_closure.features import map_features
-from maplab_py.algorithms.loop_closure.workflow import close_loops
-from maplab_py.algorithms.self_calibration.segments.splitting import extract_submap
 from maplab_py.algorithms.sparsification.options import SparsificationOptions
 from maplab_py.algorithms.sparsification.sparsify import descriptor_deviations, sparsify
-from maplab_py.errors import EstimationError
 from maplab_py.interop.csv_dataset import CsvExportOptions, export_csv_dataset
 from maplab_py.storage.native import load_map, save_map
 from maplab_py.vimap import VIMap, edits, merge, tables
@@ -134,12 +130,6 @@ def test_layouts_of_merged_maps_stay_apart(folders: dict[int, Path], tmp_path: P
     }
 
 
-def test_segments_of_calibration_carry_no_descriptors(marked: VIMap) -> None:
-    part = extract_submap(marked, np.arange(6))
-    assert (part.feature_type == -1).all()
-    assert check_consistency(part).failure == ""
-
-
 # -- who takes which type -------------------------------------------------------------------------
 
 
@@ -188,24 +178,6 @@ def test_another_feature_type_than_the_landmarks_is_a_warning() -> None:
     assert not [
         w for w in check_consistency(m.replace(landmarks=right)).warnings if "type" in w.rule
     ]
-
-
-def test_places_are_recognised_by_binary_descriptors_alone(marked: VIMap) -> None:
-    features, _ = map_features(marked, np.arange(1))
-    assert (marked.feature_type[features.keypoint] == 0).all()
-    assert features.kind.size == 48
-    usable = np.count_nonzero(marked.binary_descriptor_size)
-    assert 0.9 * usable < len(features) <= usable
-
-
-def test_a_map_without_binary_descriptors_is_refused_in_one_line() -> None:
-    m = with_blocks(walk_map(), (4, 5, 1), (8, 0, 7))
-    with pytest.raises(EstimationError) as refused:
-        close_loops(m)
-    assert str(refused.value) == (
-        "the map has no Binary descriptors, only SuperPoint, type 7: --lc_feature_type=SuperPoint takes "
-        "those, extract_features makes others"
-    )
 
 
 def test_landmarks_are_scored_by_their_binary_descriptors() -> None:

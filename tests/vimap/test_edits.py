@@ -1,7 +1,5 @@
 """Edits of maps, parts of them, and what they hold."""
 
-import itertools
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -15,19 +13,12 @@ from maplab_py.vimap.edits import merge_landmarks, remove_keypoints, with_p_G
 from maplab_py.vimap.excerpts import cut_by_time, excerpt, mission_maps
 from tests.algorithms.loop_closure.rooms import Walk, make_map
 from tests.simulation.small import simulated
-from tests.support.submaps import append_submaps
 from tests.vimap.builders import SAMPLES, walk_map
 
 
 def same_places(before: VIMap, after: VIMap) -> None:
     rows = before.landmark_index.rows(after.landmarks.id)
     np.testing.assert_allclose(after.p_G, before.p_G[rows], atol=1e-12)
-
-
-def test_the_example_is_consistent():
-    report = check_consistency(walk_map())
-    assert report.errors == ()
-    assert report.failure == ""
 
 
 def test_removed_vertices_join_imu_and_odometry():
@@ -241,22 +232,6 @@ def test_an_edit_that_removes_vertices_is_refused(both: VIMap) -> None:
     part = excerpt(both, np.arange(8))
     with pytest.raises(ValueError, match="number of vertices"):
         part.written_back(excerpt(both, np.arange(7)).vi_map)
-
-
-def test_submaps_cut_by_time_join_to_the_map_again() -> None:
-    session = simulated().maps[0]
-    submaps = cut_by_time(session, 2.0)
-    assert len(submaps) == 3
-    for a, b in itertools.pairwise(submaps):
-        assert np.array_equal(a.vertices.id[-1], b.vertices.id[0])
-    joined, report = append_submaps(submaps)
-    assert report.vertices_shared == 2
-    assert np.array_equal(joined.vertices.id, session.vertices.id)
-    np.testing.assert_allclose(joined.vertices.T_M_I, session.vertices.T_M_I, atol=1e-9)
-    assert len(joined.imu_samples) == len(session.imu_samples)
-    observed = np.count_nonzero(np.diff(session.observation_start))
-    assert len(joined.landmarks) == observed
-    assert len(joined.observations) == len(session.observations)
 
 
 def test_a_short_session_is_one_submap() -> None:

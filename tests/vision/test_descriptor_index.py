@@ -1,6 +1,5 @@
 import dataclasses
 
-import numba
 import numpy as np
 import pytest
 
@@ -98,20 +97,6 @@ def test_rule_keeps_near_times_and_own_session_out():
     assert np.all(np.abs(time_ns[query] - time_ns[found.row[query, k]]) >= 2 * 10**9)
     own = index.nearest(unlabelled, 3, MatchRule(other_sessions_only=True))
     assert np.all(own.row == -1)
-
-
-def test_multi_index_is_the_same_on_any_number_of_threads(features):
-    _, database = features
-    answers = []
-    before = numba.get_num_threads()
-    try:
-        for threads in (1, before):
-            numba.set_num_threads(threads)
-            index = InvertedMultiIndex(database, seed=3)
-            answers.append(index.nearest(database, 3, MatchRule()).row.tobytes())
-    finally:
-        numba.set_num_threads(before)
-    assert answers[0] == answers[1]
 
 
 def test_an_empty_index_has_no_neighbours(features):

@@ -48,13 +48,6 @@ def test_variables(text: str, words: list[list[str]]) -> None:
     assert [command.words for command in typed_commands(text, lookup)] == words
 
 
-def test_a_nul_character_is_refused(runner: Runner, capsys: Capture) -> None:
-    assert runner.run_text("echo a; solve --folder=b\0c") == Status.USER_ERROR
-    out, err = capsys.readouterr()
-    assert (out, len(err.splitlines())) == ("", 1)
-    assert "the character NUL" in err
-
-
 def test_an_unset_variable_is_an_error() -> None:
     with pytest.raises(FlagError, match=r"\$NO_SUCH_THING is not set"):
         typed_commands("echo $NO_SUCH_THING", variable_lookup({}))

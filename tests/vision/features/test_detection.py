@@ -126,15 +126,3 @@ def test_noise_of_a_dark_image_is_no_corner() -> None:
     noise = np.random.default_rng(0).normal(5.0, 1.5, (240, 360))
     image = np.clip(np.round(noise), 0, 255).astype(np.uint8)
     assert len(detect(image, FeatureOptions())) == 0
-
-
-def test_threads_do_not_matter() -> None:
-    image, found = mosaic(3), []
-    before = cv2.getNumThreads()
-    try:
-        for threads in (1, 2, 4):
-            cv2.setNumThreads(threads)
-            found.append(detect(image, FeatureOptions()).tobytes())
-    finally:
-        cv2.setNumThreads(before)
-    assert len(set(found)) == 1

@@ -113,15 +113,6 @@ def test_points_off_their_epipolar_line_are_not_matched() -> None:
     assert len(common(*images.cameras)[0]) < 0.1 * len(common(*aligned.cameras)[0])
 
 
-def test_resized_images() -> None:
-    rig, T_G_I = stereo(), pose()
-    options = dataclasses.replace(OPTIONS, image_resize_factor=0.6)
-    (images,) = run(rig, [T_G_I], options)
-    errors = stereo_errors_px(rig, T_G_I, images)
-    assert len(errors) > 30
-    assert np.median(errors) < 0.3
-
-
 def test_cameras_of_different_sizes() -> None:
     """Half the size means a level less: points are sought on those that both images have."""
     rig, T_G_I = stereo(), pose()

@@ -9,8 +9,7 @@ import pytest
 
 from maplab_py.array_types import F64, U8
 from maplab_py.errors import FlagError, MapError
-from maplab_py.geometry import se3, so3
-from maplab_py.sensors import Camera, Distortion, Projection
+from maplab_py.geometry import se3
 from maplab_py.vision.tracking.options import TrackingOptions
 from maplab_py.vision.tracking.tracker import FrameTracker
 from maplab_py.vision.tracking.tracks import CameraTracks, TrackedImages
@@ -87,36 +86,6 @@ def test_the_gyroscope_finds_what_a_fast_turn_has_moved_far() -> None:
     assert len(errors) >= 25
     assert np.mean(errors < 1.0) > 0.9
     assert len(common(first.cameras[0], unknown.cameras[0])[0]) < 0.4 * len(errors)
-
-
-def test_an_unknown_turn_is_no_obstacle() -> None:
-    rig, poses = mono(), [pose(), pose(y=0.05, yaw=0.02)]
-    tracker = FrameTracker(rig.cameras, rig.T_I_C, OPTIONS)
-    first, second = (tracker.track(k, rig.images(T)) for k, T in enumerate(poses))
-    errors = errors_px(rig, poses, [first, second])
-    assert len(errors) > 0.7 * len(first.cameras[0])
-    assert np.median(errors) < 0.15
-
-
-def test_a_warped_image() -> None:
-    """The homography of a turn, with a camera without distortion."""
-    K = np.array([[250.0, 0, 180.0], [0, 250.0, 120.0], [0, 0, 1.0]])
-    camera = Camera(
-        "0" * 32, Projection.PINHOLE, Distortion.NONE, K[[0, 1, 0, 1], [0, 1, 2, 2]], np.zeros(0), 360, 240
-    )  # fmt: skip
-    R_C0_C1 = so3.to_matrix(so3.exp(np.array([0.04, -0.06, 0.08])))
-    H = K @ R_C0_C1.T @ np.linalg.inv(K)
-    image = cv2.GaussianBlur(mosaic(), (0, 0), 1.0)
-    warped = cv2.warpPerspective(image, H, (360, 240), borderMode=cv2.BORDER_REFLECT)
-    tracker = FrameTracker((camera,), se3.identity(1), OPTIONS)
-    first, second = tracker.track(0, (image,)), tracker.track(1, (warped,), R_C0_C1)
-    a, b = common(first.cameras[0], second.cameras[0])
-    expected = np.column_stack([a, np.ones(len(a))]) @ H.T
-    errors = np.linalg.norm(expected[:, :2] / expected[:, 2:] - b, axis=1)
-    assert len(a) > 0.6 * len(first.cameras[0])
-    assert np.median(errors) < 0.1
-    assert errors.max() < 1.0
-    assert second.is_turn_only
 
 
 def test_what_moves_by_itself_is_an_outlier() -> None:

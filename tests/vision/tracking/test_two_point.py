@@ -110,13 +110,3 @@ def test_few_tracks(count: int, knows_turn: bool) -> None:
     if knows_turn:
         assert motion.is_inlier.all()
     assert np.isfinite(motion.R_C1_C0_refined).all()
-
-
-def test_the_same_seed_gives_the_same_result() -> None:
-    pair = make_pair(np.array([0.05, 0.0, 0.02]), outliers=60)
-    first, second = (
-        two_point_motion(pair.ray_C0, pair.ray_C1, pair.R_C1_C0, LIMITS, 7) for _ in range(2)
-    )
-    assert np.array_equal(first.is_inlier, second.is_inlier)
-    assert first.direction_C1.tobytes() == second.direction_C1.tobytes()
-    assert first.R_C1_C0_refined.tobytes() == second.R_C1_C0_refined.tobytes()
