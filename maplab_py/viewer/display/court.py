@@ -3,14 +3,13 @@
 A page only collects verdicts. The command judge_closures applies them to the map.
 """
 
-import threading
-from collections.abc import Callable
+from __future__ import annotations
+
 from functools import partial
 from html import escape
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import viser
 
 from maplab_py.algorithms.loop_closure.closure_record import USES, read_record
 from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
@@ -20,10 +19,11 @@ from maplab_py.array_types import I64
 from maplab_py.errors import MapError
 from maplab_py.viewer import facts, picking, scene
 from maplab_py.viewer.display import camera, panel, parts
-from maplab_py.viewer.display.selection import Selection
-from maplab_py.viewer.drawing import Drawing
 from maplab_py.viewer.layers.closures import closure_ends
 from maplab_py.vimap import VIMap, to_hex, to_hex_list
+
+if TYPE_CHECKING:
+    from maplab_py.viewer.display.viewer import Viewer
 
 Colour = tuple[int, int, int]
 
@@ -52,38 +52,17 @@ def cases_of(vi_map: VIMap) -> I64:
     return order[:_MAX_CASES]
 
 
-class Bench(Protocol):
-    """View that shows the case."""
-
-    @property
-    def drawing(self) -> Drawing:
-        """The map as it is drawn."""
-
-    @property
-    def selection(self) -> Selection:
-        """Picked entities."""
-
-    def select(self, picked: picking.Pick) -> None:
-        """Mark a thing and show its facts."""
-
-
 class Court:
     """The widgets, the case that is open, and the verdicts."""
 
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        bench: Bench,
-        lock: threading.RLock,
-        say: Callable[[str], None],
-    ) -> None:
+    def __init__(self, viewer: Viewer) -> None:
         """Start without cases."""
-        self._bench = bench
+        self._viewer = viewer
         self._cases = np.zeros(0, dtype=np.int64)
         self._map: VIMap | None = None
         self._place = -1
         self._verdicts: dict[str, bool] = {}  # by id of the closure; True = accepted
-        gui = server.gui
+        gui = viewer.server.gui
         self._folder = gui.add_folder(
             "Closure court", order=0.5, visible=False, expand_by_default=False
         )
@@ -92,7 +71,7 @@ class Court:
             self.text = gui.add_html("")
             for label, key, verdict, colour, hint in _BUTTONS:
                 button = gui.add_button(label, color=colour, hint=f"{hint} (key {key})")
-                callback = parts.by_user(lock, partial(self.judge, verdict), say)
+                callback = viewer.by_user(partial(self.judge, verdict))
                 button.on_click(callback)
                 gui.add_command(f"closure court: {label}", hotkey=key).on_trigger(callback)
 
@@ -101,8 +80,7 @@ class Court:
         if vi_map is self._map:
             return
         self._map, self._cases, self._place = vi_map, cases_of(vi_map), -1
-        if self._folder.visible != bool(len(self._cases)):
-            self._folder.visible = bool(len(self._cases))
+        parts.update(self._folder, visible=bool(len(self._cases)))
         self._show_images()
         self._say()
 
@@ -124,10 +102,10 @@ class Court:
             self._verdicts[to_hex(closures.id[self._cases[self._place]])] = verdict
         self._place = (self._place + 1) % len(self._cases)
         row = int(self._cases[self._place])
-        drawing = self._bench.drawing
+        drawing = self._viewer.drawing
         ends = np.concatenate(closure_ends(drawing, closures.take(np.array([row]))))
         p = drawing.p_vertices[ends]
-        self._bench.select(picking.Pick(scene.Entity.CLOSURE, row, p.mean(axis=0), 0.0))
+        self._viewer.select(picking.Pick(scene.Entity.CLOSURE, row, p.mean(axis=0), 0.0))
         self._show_images()
         if event.client is not None:
             distance_m = 1.5 * float(np.linalg.norm(p[1] - p[0])) + 0.4 * drawing.extent.radius_m
@@ -137,11 +115,10 @@ class Court:
 
     def _show_images(self) -> None:
         """Show both images of the open case with lines between what they have in common."""
-        picture = self._bench.selection.picture if self._place >= 0 else None
+        picture = self._viewer.selection.picture if self._place >= 0 else None
         if picture is not None:
             self.image.image = picture
-        if self.image.visible != (picture is not None):
-            self.image.visible = picture is not None
+        parts.update(self.image, visible=picture is not None)
 
     def _say(self, note: str = "") -> None:
         """Write which case is open, and what was decided."""

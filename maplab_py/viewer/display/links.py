@@ -1,21 +1,22 @@
 """Links that open a view again: map, camera, layers and selection behind the # of the page's address."""
 
+from __future__ import annotations
+
 import dataclasses
-import threading
 import zlib
-from collections.abc import Callable
 from html import escape
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl, urlencode
 
 import numpy as np
-import viser
 
 from maplab_py.array_types import F64
 from maplab_py.errors import UserError
-from maplab_py.viewer.display import parts, selection
 from maplab_py.viewer.drawing import Drawing
 from maplab_py.viewer.picking import id_of
+
+if TYPE_CHECKING:
+    from maplab_py.viewer.display.viewer import Viewer
 
 KEY = "maplab_link"
 """Item of local storage in whose place `page.js` reads and writes the page's address."""
@@ -80,55 +81,26 @@ def map_code(drawing: Drawing) -> str:
     return f"{zlib.crc32(''.join(sorted(drawing.mission_ids)).encode()):08x}"
 
 
-class View(Protocol):
-    """View that is shared."""
-
-    @property
-    def drawing(self) -> Drawing:
-        """The map as it is drawn; raises UserError while nothing is shown."""
-
-    @property
-    def visible_layers(self) -> set[str]:
-        """Names of the layers that are drawn."""
-
-    selections: selection.Selections
-
-    def set_layers(self, visible: set[str]) -> set[str]:
-        """Show these layers and no others; return those that the map has not."""
-
-    def fly_to(self, text: str) -> None:
-        """Select what an id means, and move the cameras of pages there; UserError if it means nothing."""
-
-
 class Links:
     """The button that makes a link, and the pages that are opened by one."""
 
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        view: View,
-        lock: threading.RLock,
-        folder: Any,
-        say: Callable[[str], None],
-    ) -> None:
+    def __init__(self, viewer: Viewer, folder: Any) -> None:
         """Add the button to a folder of the panel."""
-        self._server = server
-        self._view = view
-        self._lock = lock
+        self._viewer = viewer
         with folder:
-            button = server.gui.add_button(
+            button = viewer.server.gui.add_button(
                 "copy link", hint="a link that opens this map with this camera, layers, selection"
             )
-        button.on_click(parts.by_user(lock, lambda event: self.copy(event.client), say))
-        server.on_client_connect(self.restore)
+        button.on_click(viewer.by_user(lambda event: self.copy(event.client)))
+        viewer.server.on_client_connect(self.restore)
 
     def copy(self, client: Any) -> None:
         """Turn a page's address into a link to what it shows, and copy it."""
         try:
-            drawing = self._view.drawing
+            drawing = self._viewer.drawing
             camera = np.stack([client.camera.position, client.camera.look_at]) + drawing.origin_G
-            layers = tuple(sorted(self._view.visible_layers))
-            picked = self._view.selections.of(client).picked
+            layers = tuple(sorted(self._viewer.visible_layers))
+            picked = self._viewer.selections.of(client).picked
             picked_id = "" if picked is None else id_of(drawing.vi_map, picked)
             text = link_text(SharedView(map_code(drawing), camera, layers, picked_id))
         except UserError as error:
@@ -140,15 +112,15 @@ class Links:
     def go(self, id_: str) -> str:
         """Let all pages show what an id means; return a page that says so, or becomes the first one."""
         try:
-            with self._lock:
-                self._view.fly_to(id_)
-                drawing, picked = self._view.drawing, self._view.selections.newest.picked
-                if self._server.get_clients() or picked is None:
+            with self._viewer.lock:
+                self._viewer.fly_to(id_)
+                drawing, picked = self._viewer.drawing, self._viewer.selections.newest.picked
+                if self._viewer.server.get_clients() or picked is None:
                     return _TEXT.format(f"{id_[:8]} is selected in the open page of the viewer.")
                 distance_m = 0.25 * drawing.extent.radius_m
                 position = picked.p + distance_m * np.array([0.0, -0.8, 0.6])
                 camera = np.stack([position, picked.p]) + drawing.origin_G
-                layers = tuple(sorted(self._view.visible_layers))
+                layers = tuple(sorted(self._viewer.visible_layers))
                 picked_id = id_of(drawing.vi_map, picked)
                 text = link_text(SharedView(map_code(drawing), camera, layers, picked_id))
         except UserError as error:
@@ -164,13 +136,13 @@ class Links:
         if not text:
             return
         try:
-            with self._lock:
+            with self._viewer.lock:
                 self._show(client, read_link(text))
         except UserError as error:
             _tell(client, str(error))
 
     def _show(self, client: Any, shared: SharedView) -> None:
-        drawing = self._view.drawing
+        drawing = self._viewer.drawing
         if shared.map_code != map_code(drawing):
             raise UserError(
                 "this link is of a map with other missions: load it, then reload the page"
@@ -179,9 +151,9 @@ class Links:
         with client.atomic():
             client.camera.position = position
             client.camera.look_at = target
-        missing = self._view.set_layers(set(shared.layers))
+        missing = self._viewer.set_layers(set(shared.layers))
         if shared.picked_id:
-            self._view.selections.jump(drawing, shared.picked_id, client)
+            self._viewer.selections.jump(drawing, shared.picked_id, client)
         if missing:
             raise UserError(f"this map has no layer {', '.join(sorted(missing))[:200]}")
 

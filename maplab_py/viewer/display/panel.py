@@ -1,12 +1,11 @@
 """The panel beside the scene: checkboxes, legend, facts, slider."""
 
-import threading
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable
 from functools import partial
 from html import escape
-from typing import Any, Protocol
-
-import viser
+from typing import TYPE_CHECKING, Any
 
 from maplab_py.viewer.colours import HIDDEN, from_hex
 from maplab_py.viewer.display import camera, parts
@@ -14,6 +13,9 @@ from maplab_py.viewer.facts import Facts
 from maplab_py.viewer.layers.closures import REFUSED
 from maplab_py.viewer.options import COLOURINGS, VisualizationOptions
 from maplab_py.viewer.scene import Layer, LegendEntry, MissionEntry, Scene
+
+if TYPE_CHECKING:
+    from maplab_py.viewer.display.viewer import Viewer
 
 MAX_SWITCHES = 24
 """Beyond this many missions the panel offers a list instead of a switch each."""
@@ -25,39 +27,13 @@ _ALL = "all missions"
 _ANY = "any reason"
 
 
-class Actions(Protocol):
-    """Requests of the panel. They change the view and never the map."""
-
-    def set_layer(self, name: str, is_visible: bool) -> None:
-        """Show or hide a layer."""
-
-    def set_missions(self, visible: set[str]) -> None:
-        """Show these missions and no others."""
-
-    def set_colouring(self, colouring: str, only_mission: str = "") -> None:
-        """Colour landmarks by another rule, all or those of a mission (id) alone."""
-
-    def set_refused_reason(self, reason: str) -> None:
-        """Show refused closures whose reason contains a text only, empty = all."""
-
-    def set_point_scale(self, factor: float) -> None:
-        """Draw points larger or smaller."""
-
-    def set_ground(self, is_visible: bool) -> None:
-        """Show or hide the grid."""
-
-    def look(self, client: Any, view: str) -> None:
-        """Move the camera of one page."""
-
-
 class Panel:
     """The widgets and what they show."""
 
-    def __init__(self, server: viser.ViserServer, actions: Actions, lock: threading.RLock) -> None:
+    def __init__(self, viewer: Viewer) -> None:
         """Make the widgets that every scene has."""
-        self._gui = server.gui
-        self._actions = actions
-        self._lock = lock
+        self._gui = viewer.server.gui
+        self._viewer = viewer
         self._checkboxes: dict[str, Any] = {}
         self._mission_of_label: dict[str, str] = {}
         self._mission_widgets: list[Any] = []
@@ -83,44 +59,34 @@ class Panel:
         self._add_view()
 
     def _bind(self, widget: Any, action: Callable[[Any], None]) -> None:
-        widget.on_update(parts.by_user(self._lock, action, self.say))
+        widget.on_update(self._viewer.by_user(action))
 
     def _choose_colouring(self) -> None:
         mission_id = self._mission_of_label.get(self.coloured_mission.value, "")
-        self._actions.set_colouring(self.colouring.value, mission_id)
+        self._viewer.set_colouring(self.colouring.value, mission_id)
 
     def _choose_reason(self, reason: str) -> None:
-        self._actions.set_refused_reason("" if reason == _ANY else reason)
+        self._viewer.set_refused_reason("" if reason == _ANY else reason)
 
     def show_reasons(self, scene: Scene, chosen: str) -> None:
         """Offer the reasons of the scene's refused closures, chosen = a part of one's text."""
         reasons = next((layer.choices for layer in scene.layers if layer.name == REFUSED), ())
         options = (_ANY, *reasons)
-        if tuple(self.refused.options) != options:
-            self.refused.options = options
         value = next((reason for reason in reasons if chosen and chosen.lower() in reason), _ANY)
-        if self.refused.value != value:
-            self.refused.value = value
-        if self.refused.visible != (len(reasons) > 1):
-            self.refused.visible = len(reasons) > 1
+        parts.update(self.refused, options=options, value=value, visible=len(reasons) > 1)
 
     def show_colouring(
         self, options: VisualizationOptions, missions: tuple[MissionEntry, ...]
     ) -> None:
         """Show by which rule landmarks are coloured, and which mission the rule is for."""
         colouring, only = options.landmark_colouring, options.color_only_missions.strip().lower()
-        if self.colouring.value != colouring:
-            self.colouring.value = colouring
+        parts.update(self.colouring, value=colouring)
         self._mission_of_label = {mission_label(m): m.id for m in missions}
         labels = (_ALL, *self._mission_of_label)
-        if tuple(self.coloured_mission.options) != labels:
-            self.coloured_mission.options = labels
         keys = self._mission_of_label.items()
         chosen = next((label for label, key in keys if only and key.startswith(only)), _ALL)
-        if self.coloured_mission.value != chosen:
-            self.coloured_mission.value = chosen
-        if self.coloured_mission.visible != (len(missions) > 1):
-            self.coloured_mission.visible = len(missions) > 1
+        is_needed = len(missions) > 1
+        parts.update(self.coloured_mission, options=labels, value=chosen, visible=is_needed)
 
     def _add_view(self) -> None:
         self.view = self._gui.add_folder("View", order=5, expand_by_default=False)
@@ -129,16 +95,10 @@ class Panel:
             self.ground = self._gui.add_checkbox("ground grid", True)
             self.point_scale = self._gui.add_slider("point size", 0.2, 5.0, 0.1, 1.0)
         self.views.on_click(
-            parts.by_user(
-                self._lock,
-                lambda event: self._actions.look(event.client, event.target.value),
-                self.say,
-            )
+            self._viewer.by_user(lambda event: self._viewer.look(event.client, event.target.value))
         )
-        self._bind(self.ground, lambda event: self._actions.set_ground(event.target.value))
-        self._bind(
-            self.point_scale, lambda event: self._actions.set_point_scale(event.target.value)
-        )
+        self._bind(self.ground, lambda event: self._viewer.set_ground(event.target.value))
+        self._bind(self.point_scale, lambda event: self._viewer.set_point_scale(event.target.value))
 
     def show(self, scene: Scene, layers: set[str], missions: set[str]) -> None:
         """Say what the scene has: its counts, legend, layers and missions."""
@@ -154,18 +114,14 @@ class Panel:
             self._make_missions(scene, missions)
         for layer in scene.layers:
             box = self._checkboxes[layer.name]
-            if box.label != layer_label(layer):
-                box.label = layer_label(layer)
-            if box.value != (layer.name in layers):
-                box.value = layer.name in layers
+            parts.update(box, label=layer_label(layer), value=layer.name in layers)
 
     def _say_what_is_shown(self, scene: Scene) -> None:
         """Fill the header; a map's only mission is named there and needs no folder."""
         is_single = len(scene.missions) == 1
         legend = mission_legend(scene.missions) if is_single else ""
         self.header.content = header(scene) + legend
-        if self._missions.visible == is_single:
-            self._missions.visible = not is_single
+        parts.update(self._missions, visible=not is_single)
 
     def say(self, message: str) -> None:
         """Show a message in the place of the header."""
@@ -185,11 +141,10 @@ class Panel:
             self._bind(box, self._layer_action(layer.name))
             self._checkboxes[layer.name] = box
         has_extra = has_many and not all(layer.is_visible for layer in scene.layers)
-        if self._more_layers.visible != has_extra:
-            self._more_layers.visible = has_extra
+        parts.update(self._more_layers, visible=has_extra)
 
     def _layer_action(self, name: str) -> Callable[[Any], None]:
-        return lambda event: self._actions.set_layer(name, event.target.value)
+        return lambda event: self._viewer.set_layer(name, event.target.value)
 
     def _make_missions(self, scene: Scene, missions: set[str]) -> None:
         for widget in self._mission_widgets:
@@ -211,7 +166,7 @@ class Panel:
         everything = {mission.id for mission in scene.missions}
         self._bind(
             chooser,
-            lambda event: self._actions.set_missions(ids.get(event.target.value, everything)),
+            lambda event: self._viewer.set_missions(ids.get(event.target.value, everything)),
         )
         self._mission_widgets.append(chooser)
 
@@ -222,7 +177,7 @@ class Panel:
         def toggle(mission: MissionEntry, button: Any) -> None:
             shown[mission.id] = not shown[mission.id]
             button.color = _switch_colour(mission, is_shown=shown[mission.id])
-            self._actions.set_missions({key for key, is_shown in shown.items() if is_shown})
+            self._viewer.set_missions({key for key, is_shown in shown.items() if is_shown})
 
         for mission in scene.missions:
             button: Any = self._gui.add_button(
@@ -231,7 +186,7 @@ class Panel:
                 hint=f"show or hide mission {mission.id}",
             )
             press = partial(lambda m, b, _: toggle(m, b), mission, button)
-            button.on_click(parts.by_user(self._lock, press, self.say))
+            button.on_click(self._viewer.by_user(press))
             self._mission_widgets.append(button)
 
 

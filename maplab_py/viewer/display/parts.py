@@ -336,6 +336,13 @@ def is_coloured(mesh: Mesh) -> bool:
 logger = logging.getLogger(__name__)
 
 
+def update(widget: Any, **values: object) -> None:
+    """Set the properties of a widget that differ: each is sent to all pages."""
+    for name, value in values.items():
+        if getattr(widget, name) != value:
+            setattr(widget, name, value)
+
+
 def by_user(
     lock: threading.RLock, action: Callable[[Any], None], say: Callable[[str], None]
 ) -> Callable[[Any], None]:

@@ -1,16 +1,16 @@
 """Playback: the steps of the time line, what the scene and the plots show at each, and the tick."""
 
+from __future__ import annotations
+
 import base64
 import logging
 import threading
 import time
-from collections.abc import Callable
 from html import escape
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-import viser
 
 from maplab_py.array_types import F64, I64, U8
 from maplab_py.viewer.building import Subject
@@ -18,30 +18,13 @@ from maplab_py.viewer.colours import AXES, hex_codes
 from maplab_py.viewer.display import panel, parts
 from maplab_py.viewer.display.camera import FREE, RIDES, ride
 from maplab_py.viewer.display.player import Player
-from maplab_py.viewer.drawing import Drawing
 from maplab_py.viewer.options import PlaybackOptions
 from maplab_py.viewer.playback import Signal, step_seconds, vertex_signals
 
+if TYPE_CHECKING:
+    from maplab_py.viewer.display.viewer import Viewer
+
 logger = logging.getLogger(__name__)
-
-
-class Played(Protocol):
-    """The view whose map is played."""
-
-    @property
-    def drawing(self) -> Drawing:
-        """The map as it is drawn."""
-
-    @property
-    def subject(self) -> Subject | None:
-        """Shown view."""
-
-    @property
-    def visible_missions(self) -> set[str]:
-        """Ids of the missions that are drawn."""
-
-    def redraw(self) -> None:
-        """Draw the whole map, or without what playback draws while it plays."""
 
 
 class Playback:
@@ -52,19 +35,10 @@ class Playback:
         options: How missions are played.
     """
 
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        view: Played,
-        lock: threading.RLock,
-        say: Callable[[str], None],
-    ) -> None:
+    def __init__(self, viewer: Viewer) -> None:
         """Show the whole map at first."""
-        self._server = server
-        self._view = view
-        self._lock = lock
-        self._say = say
-        self.time_line = TimeLine(server, self, lock, say)
+        self._viewer = viewer
+        self.time_line = TimeLine(viewer, self)
         self.player: Player | None = None
         self.options = PlaybackOptions()
         self._ride = FREE
@@ -83,14 +57,14 @@ class Playback:
 
     def set_step(self, step: int) -> None:
         """Show the map as it was after a step; the last step is the whole map."""
-        if self._view.subject is None:
+        if self._viewer.subject is None:
             return
         if step >= self.options.steps:
             self.stop()
-            self._view.redraw()
+            self._viewer.redraw()
             return
         if self.player is None:
-            self._begin(self._view.subject)
+            self._begin(self._viewer.subject)
         if self.player is not None:
             self.player.go(max(step, 0))
             self._show(self.player)
@@ -107,7 +81,7 @@ class Playback:
 
     def choose_mission(self, label: str) -> None:
         """Plot another mission."""
-        names = self._view.drawing.mission_names
+        names = self._viewer.drawing.mission_names
         if label in names and self.player is not None:
             self._mission = names.index(label)
             self._curves = self._make_curves(self.player)
@@ -127,8 +101,8 @@ class Playback:
             self.player = None
             self._signals, self._curves = (), []
         self.time_line.set_playing(False)
-        if self._view.subject is not None:
-            self._seconds = step_seconds(self._view.drawing, self.options)
+        if self._viewer.subject is not None:
+            self._seconds = step_seconds(self._viewer.drawing, self.options)
         self.time_line.show_step(self._seconds, self.options.steps, "the whole map")
 
     def end(self) -> None:
@@ -137,11 +111,15 @@ class Playback:
 
     def _begin(self, subject: Subject) -> None:
         """Send the nodes of all steps, and compute what is plotted."""
-        drawing = self._view.drawing
+        drawing = self._viewer.drawing
         self.player = Player(
-            self._server, drawing, self._view.visible_missions, self.options, subject.clouds
+            self._viewer.server,
+            drawing,
+            self._viewer.visible_missions,
+            self.options,
+            subject.clouds,
         )
-        self._view.redraw()
+        self._viewer.redraw()
         played = self.player.missions()
         if self._mission not in played.tolist():
             self._mission = int(played[0]) if len(played) else -1
@@ -164,13 +142,13 @@ class Playback:
         return np.asarray(self._seconds[step] / max(float(self._seconds[-1]), 1e-9))
 
     def _vertices_of_mission(self) -> I64:
-        start = self._view.drawing.vi_map.vertex_start
+        start = self._viewer.drawing.vi_map.vertex_start
         return np.arange(start[self._mission], start[self._mission + 1])
 
     def _show(self, player: Player) -> None:
         """Show a step on the time line, and move the view if it rides along."""
         vertex = player.head(self._mission)
-        image = self._view.drawing.images(vertex) if vertex >= 0 else None
+        image = self._viewer.drawing.images(vertex) if vertex >= 0 else None
         rows = [
             (title, paths, value_text(signal, vertex) if vertex >= 0 else "")
             for signal, (title, paths) in zip(self._signals, self._curves, strict=True)
@@ -179,23 +157,23 @@ class Playback:
         plots = strip_chart(rows, at, "" if image is None else image_tag(image))
         self.time_line.show_step(self._seconds, player.step, player.note(), plots)
         if vertex >= 0 and self._ride != FREE:
-            for client in self._server.get_clients().values():
+            for client in self._viewer.server.get_clients().values():
                 with client.atomic():
-                    ride(client.camera, self._view.drawing, vertex, self._ride)
+                    ride(client.camera, self._viewer.drawing, vertex, self._ride)
 
     def _tick(self) -> None:
         """Move the slider while it plays."""
         while not self._is_stopped:
             time.sleep(1.0 / self.options.vertex_frequency)
             try:
-                with self._lock:
+                with self._viewer.lock:
                     if not self._is_stopped and self.time_line.is_playing and self.player:
                         self.set_step(self.player.step + 1)
             except Exception:
                 logger.exception("the viewer cannot play on")
-                with self._lock:
+                with self._viewer.lock:
                     self.time_line.set_playing(False)
-                    self._say("playing stopped: the log file has the reason")
+                    self._viewer.say("playing stopped: the log file has the reason")
 
 
 _WIDTH, _HEIGHT = 1000, 100
@@ -322,63 +300,41 @@ _MARGIN_PX = 15
 _HINT = "Move the slider to play the missions: plots of the first one appear here."
 
 
-class Playing(Protocol):
-    """Requests of the time line."""
-
-    def set_time(self, time_s: float) -> None:
-        """Show the map as it was at a time."""
-
-    def set_playing(self, is_playing: bool) -> None:
-        """Play or pause."""
-
-    def choose_mission(self, label: str) -> None:
-        """Plot another mission."""
-
-    def set_ride(self, ride: str) -> None:
-        """Let the view ride along, one of `RIDES`."""
-
-
 class TimeLine:
     """The widgets, in a window of their own that a user can move, minimise and dock."""
 
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        playing: Playing,
-        lock: threading.RLock,
-        say: Callable[[str], None],
-    ) -> None:
+    def __init__(self, viewer: Viewer, playback: Playback) -> None:
         """Make the widgets."""
-        self._playing = playing
+        self._playback, gui = playback, viewer.server.gui
         self._is_sliding = False
         self.is_playing = False
-        self.panel = server.gui.add_panel()
+        self.panel = gui.add_panel()
         with self.panel.add_tab("Time line"):
-            self.slider: Any = server.gui.add_slider("time [s]", 0.0, 1.0, _SLIDER_STEP_S, 1.0)
-            self.play: Any = server.gui.add_button(_PLAY, hint="space bar")
-            self.ride: Any = server.gui.add_dropdown(
+            self.slider: Any = gui.add_slider("time [s]", 0.0, 1.0, _SLIDER_STEP_S, 1.0)
+            self.play: Any = gui.add_button(_PLAY, hint="space bar")
+            self.ride: Any = gui.add_dropdown(
                 "view", RIDES, hint="let the view ride along with the plotted mission"
             )
-            self.mission: Any = server.gui.add_dropdown("plots of", ("",), visible=False)
-            self.time = server.gui.add_html(panel.hint("the whole map"))
-            self.plots = server.gui.add_html(panel.hint(_HINT))
+            self.mission: Any = gui.add_dropdown("plots of", ("",), visible=False)
+            self.time = gui.add_html(panel.hint("the whole map"))
+            self.plots = gui.add_html(panel.hint(_HINT))
         self.panel.float(x=_MARGIN_PX, y=-_MARGIN_PX, width=_WIDTH_PX)
         self.panel.minimize()
         for widget, action in (
             (self.slider, self._slide),
-            (self.ride, lambda event: playing.set_ride(event.target.value)),
-            (self.mission, lambda event: playing.choose_mission(event.target.value)),
+            (self.ride, lambda event: playback.set_ride(event.target.value)),
+            (self.mission, lambda event: playback.choose_mission(event.target.value)),
         ):
-            widget.on_update(parts.by_user(lock, action, say))
-        toggle = parts.by_user(lock, lambda _: playing.set_playing(not self.is_playing), say)
+            widget.on_update(viewer.by_user(action))
+        toggle = viewer.by_user(lambda _: playback.set_playing(not self.is_playing))
         self.play.on_click(toggle)
-        server.gui.add_command("play or pause the missions", hotkey="space").on_trigger(toggle)
+        gui.add_command("play or pause the missions", hotkey="space").on_trigger(toggle)
 
     def _slide(self, event: Any) -> None:
         """Follow the slider, which the user may hold: it must not be pushed back meanwhile."""
         self._is_sliding = True
         try:
-            self._playing.set_time(float(event.target.value))
+            self._playback.set_time(float(event.target.value))
         finally:
             self._is_sliding = False
 
@@ -389,12 +345,9 @@ class TimeLine:
     def show_missions(self, labels: tuple[str, ...], chosen: str) -> None:
         """Offer missions to plot; one alone needs no list."""
         options = labels or ("",)
-        if tuple(self.mission.options) != options:
-            self.mission.options = options
-        if labels and self.mission.value != chosen:
-            self.mission.value = chosen
-        if self.mission.visible != (len(labels) > 1):
-            self.mission.visible = len(labels) > 1
+        parts.update(self.mission, options=options, visible=len(labels) > 1)
+        if labels:
+            parts.update(self.mission, value=chosen)
 
     def show_step(self, seconds: F64, step: int, note: str, plots: str = "") -> None:
         """Move the slider, which may have another length now, unless it moved us.
@@ -416,12 +369,9 @@ class TimeLine:
 
     def show_ride(self, ride: str) -> None:
         """Show how the view rides along."""
-        if self.ride.value != ride:
-            self.ride.value = ride
+        parts.update(self.ride, value=ride)
 
     def set_playing(self, is_playing: bool) -> None:
         """Show whether it plays."""
         self.is_playing = is_playing
-        label = _PAUSE if is_playing else _PLAY
-        if self.play.label != label:
-            self.play.label = label
+        parts.update(self.play, label=_PAUSE if is_playing else _PLAY)

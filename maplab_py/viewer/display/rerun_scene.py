@@ -4,7 +4,6 @@ Needs the library rerun-sdk (the extra `rerun`). Layers are those that the brows
 poses and images have the times of their vertices.
 """
 
-import functools
 import importlib.util
 import tempfile
 from pathlib import Path
@@ -15,7 +14,7 @@ import numpy as np
 from maplab_py.array_types import F64
 from maplab_py.cancellation import check_cancelled
 from maplab_py.errors import UserError
-from maplab_py.output_files import check_writable, write_bytes
+from maplab_py.output_files import check_writable, copy_file
 from maplab_py.sensors import Camera
 from maplab_py.viewer.building import Subject, make_checked_drawing, scene_of
 from maplab_py.viewer.drawing import Drawing, axis_lines
@@ -25,7 +24,6 @@ from maplab_py.viewer.scene import WHOLE_MAP, Axes, Mesh, Part, Points, Scene
 
 _ROOT = "map"
 _TIME = "time"
-_BLOCK_BYTES = 1 << 20
 
 
 def show_in_rerun(
@@ -62,9 +60,7 @@ def show_in_rerun(
         recording.save(written)
         _log(recording, scene, drawing, images)
         recording.disconnect()
-        with written.open("rb") as stream:
-            blocks = iter(functools.partial(stream.read, _BLOCK_BYTES), b"")
-            write_bytes(file, blocks, overwrite=overwrite)
+        copy_file(written, file, overwrite=overwrite)
     return scene
 
 

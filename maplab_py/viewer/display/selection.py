@@ -1,13 +1,13 @@
 """Selected entities of each page: their facts, frusta and rays, and the distance between two picks."""
 
+from __future__ import annotations
+
 import dataclasses
-import threading
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-import viser
 from numpy.typing import NDArray
 
 from maplab_py.algorithms.landmarks.sightings import residuals
@@ -23,6 +23,9 @@ from maplab_py.viewer.layers import cameras, closures
 from maplab_py.viewer.picking import MIN_DIGITS, Pick, find_by_id, id_of
 from maplab_py.viewer.scene import Entity, Part
 from maplab_py.vimap import VIMap, descriptors, ragged_rows
+
+if TYPE_CHECKING:
+    from maplab_py.viewer.display.viewer import Viewer
 
 _HINT = "Click a vertex, a landmark or a loop closure."
 _MAX_FRUSTA = 16
@@ -88,8 +91,7 @@ class _Widgets:
         """Show an image (H, W, 3), or none."""
         if image is not None:
             self.image.image = image
-        if self.image.visible != (image is not None):
-            self.image.visible = image is not None
+        parts.update(self.image, visible=image is not None)
 
 
 class Selection:
@@ -217,32 +219,16 @@ class Selections:
         on_pick: Told the id of each pick.
     """
 
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        folder: Any,
-        drawing: Callable[[], Drawing],
-        lock: threading.RLock,
-        say: Callable[[str], None],
-    ) -> None:
-        """Give every page its widgets in a folder of the panel.
-
-        Args:
-            server: Where.
-            folder: Folder.
-            drawing: Returns the map as it is drawn.
-            lock: Held while a page is served.
-            say: Shows a message.
-        """
-        self._server, self._folder, self._drawing = server, folder, drawing
-        self._lock, self._say = lock, say
+    def __init__(self, viewer: Viewer, folder: Any) -> None:
+        """Give every page its widgets in a folder of the panel."""
+        self._viewer, self._folder = viewer, folder
         self._general = Selection()
         self.pages: dict[int, Selection] = {}
         self._live: U8 | None = None
         self.newest = self._general
         self.on_pick: Callable[[str], None] = lambda _: None
-        server.on_client_connect(self._open)
-        server.on_client_disconnect(self._close)
+        viewer.server.on_client_connect(self._open)
+        viewer.server.on_client_disconnect(self._close)
 
     def of(self, page: Any) -> Selection:
         """Return the selection of a page, which begins as the console's."""
@@ -253,7 +239,8 @@ class Selections:
             self.pages[key] = selection = Selection(page, self._make_widgets(page))
             selection.is_measuring, picked = self._general.is_measuring, self._general.picked
             if picked is not None:
-                selection.show(self._drawing(), picked, _content(self._drawing(), picked))
+                drawing = self._viewer.drawing
+                selection.show(drawing, picked, _content(drawing, picked))
             elif self._live is not None:
                 selection.show_image(self._live)
         return self.pages[key]
@@ -290,7 +277,7 @@ class Selections:
 
     def show_image(self, image: U8 | None) -> None:
         """Show an image (H, W, 3), or none, in all pages, as of a recording that runs."""
-        with self._lock:
+        with self._viewer.lock:
             self._live = image
             self._in_all(lambda selection: selection.show_image(image))
 
@@ -301,16 +288,16 @@ class Selections:
             try:
                 change(selection)
             except RuntimeError:  # a widget has gone with its page
-                if key in self._server.get_clients():
+                if key in self._viewer.server.get_clients():
                     raise
 
     def _open(self, page: Any) -> None:
-        with self._lock:
-            if page.client_id in self._server.get_clients():  # else it has left already
+        with self._viewer.lock:
+            if page.client_id in self._viewer.server.get_clients():  # else it has left already
                 self.of(page)
 
     def _close(self, page: Any) -> None:
-        with self._lock:
+        with self._viewer.lock:
             self.pages.pop(page.client_id, None)
 
     def _make_widgets(self, page: Any) -> _Widgets:
@@ -320,9 +307,8 @@ class Selections:
             self.of(page).is_measuring = event.target.value
 
         for widget, action in ((widgets.jump, self._go), (widgets.measuring, measure)):
-            widget.on_update(parts.by_user(self._lock, action, self._say))
-        clear = parts.by_user(self._lock, lambda _: self.of(page).clear(), self._say)
-        widgets.clear.on_click(clear)
+            widget.on_update(self._viewer.by_user(action))
+        widgets.clear.on_click(self._viewer.by_user(lambda _: self.of(page).clear()))
         return widgets
 
     def _go(self, event: Any) -> None:
@@ -330,7 +316,7 @@ class Selections:
         text, selection = event.target.value, self.of(event.client)
         if len(text.strip()) < MIN_DIGITS:
             return
-        drawing = self._drawing()
+        drawing = self._viewer.drawing
         try:
             picked = self.jump(drawing, text, event.client)
         except UserError as error:

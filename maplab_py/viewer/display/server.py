@@ -8,10 +8,10 @@ import logging
 import re
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from importlib import resources
 from typing import Any
+from unittest import mock
 
 import rich
 import viser
@@ -62,7 +62,7 @@ def start_server(port: int, go: Callable[[str], str]) -> viser.ViserServer:
     _hush_libraries()
     with (
         _patching,
-        _patch(websockets.asyncio.server, "serve", _restricted_serve(go)),
+        mock.patch.object(websockets.asyncio.server, "serve", _restricted_serve(go)),
     ):
         try:
             server = viser.ViserServer(host=LOOPBACK, port=port, verbose=False, label="maplab")
@@ -163,13 +163,3 @@ def _hush_libraries() -> None:
         if not any(isinstance(handler, _Forwarder) for handler in library.handlers):
             library.addHandler(_Forwarder())
         library.propagate = False
-
-
-@contextmanager
-def _patch(owner: Any, name: str, value: Any) -> Iterator[None]:
-    before = getattr(owner, name)
-    setattr(owner, name, value)
-    try:
-        yield
-    finally:
-        setattr(owner, name, before)

@@ -1,12 +1,11 @@
 """Light and dark pages: each follows its system until its user chooses."""
 
-import threading
-from collections.abc import Callable
-from typing import Any
+from __future__ import annotations
 
-import viser
+from typing import TYPE_CHECKING, Any
 
-from maplab_py.viewer.display.parts import by_user
+if TYPE_CHECKING:
+    from maplab_py.viewer.display.viewer import Viewer
 
 KEY = "maplab_theme"
 """Item of local storage in whose place `page.js` gives the theme of the page: its own, or its system's."""
@@ -18,31 +17,21 @@ _ANSWER_S = 300.0
 class Themes:
     """The theme of each page."""
 
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        folder: Any,
-        lock: threading.RLock,
-        say: Callable[[str], None],
-        *,
-        is_dark: bool,
-    ) -> None:
+    def __init__(self, viewer: Viewer, folder: Any, *, is_dark: bool) -> None:
         """Add the button to a folder of the panel.
 
         Args:
-            server: Of the pages.
+            viewer: Of the pages.
             folder: Where the button is.
-            lock: Held while a page is served.
-            say: Shows a message.
             is_dark: Let all pages be dark at first, whatever their systems are.
         """
-        self._server = server
+        self._server = server = viewer.server
         self._is_dark = is_dark
         self._of_page: dict[int, bool] = {}
         configure(server.gui, is_dark=is_dark)
         with folder:
             button = server.gui.add_button("light or dark", hint="change the theme of this page")
-        button.on_click(by_user(lock, lambda event: self._toggle(event.client), say))
+        button.on_click(viewer.by_user(lambda event: self._toggle(event.client)))
         server.on_client_connect(self._follow_system)
         server.on_client_disconnect(self._forget)
 

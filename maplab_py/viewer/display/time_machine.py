@@ -1,44 +1,32 @@
 """The undo history of the map as a slider in the panel, with the errors of its states."""
 
-import threading
-from collections.abc import Callable
-from typing import Any
+from __future__ import annotations
 
-import viser
+from typing import TYPE_CHECKING, Any
 
 from maplab_py.viewer import building, history
-from maplab_py.viewer.display.parts import by_user
+from maplab_py.viewer.display import parts
+
+if TYPE_CHECKING:
+    from maplab_py.viewer.display.viewer import Viewer
 
 
 class TimeMachine:
     """The widgets; they are there when the map has more than one state."""
 
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        show_state: Callable[[int], None],
-        lock: threading.RLock,
-        say: Callable[[str], None],
-    ) -> None:
-        """Make the widgets.
-
-        Args:
-            server: Where.
-            show_state: Shows another state of the map (its place in the history).
-            lock: Held while a page is served.
-            say: Shows a message.
-        """
-        self._lock = lock
-        self._folder = server.gui.add_folder("History", order=1.5, visible=False)
+    def __init__(self, viewer: Viewer) -> None:
+        """Make the widgets."""
+        self._lock, gui = viewer.lock, viewer.server.gui
+        self._folder = gui.add_folder("History", order=1.5, visible=False)
         with self._folder:
-            self.slider: Any = server.gui.add_slider(
+            self.slider: Any = gui.add_slider(
                 "state", 0, 1, 1, 1, hint="the map before and after each command"
             )
-            self.swipe: Any = server.gui.add_checkbox(
+            self.swipe: Any = gui.add_checkbox(
                 "swipe line", False, hint="the state left of a line, the map right of it"
             )
-            self.chart = server.gui.add_html("")
-        show = by_user(lock, lambda _: show_state(int(self.slider.value)), say)
+            self.chart = gui.add_html("")
+        show = viewer.by_user(lambda _: viewer.set_state(int(self.slider.value)))
         self.swipe.on_update(show)
         self.slider.on_update(show)
         self._is_stopped = False
@@ -55,20 +43,16 @@ class TimeMachine:
         """Show the history of a subject, with the curves that are known of it."""
         self._subject = subject
         states = subject.history
-        if self._folder.visible != (len(states) > 1):
-            self._folder.visible = len(states) > 1
+        parts.update(self._folder, visible=len(states) > 1)
         if len(states) < 2:
             return
         is_swiped = subject.other is not None and subject.arrangement == "swipe"
-        if self.swipe.value != is_swiped:
-            self.swipe.value = is_swiped
-        if int(self.slider.max) != len(states) - 1:
-            self.slider.max = len(states) - 1
+        parts.update(self.swipe, value=is_swiped)
+        parts.update(self.slider, max=len(states) - 1)
         place = subject.place
         if place < 0:  # another map is left of the swipe line
             place = max(subject.replace(other=None).place, 0)
-        if int(self.slider.value) != place:
-            self.slider.value = place
+        parts.update(self.slider, value=place)
         is_known = self._measured is not None and self._measured.history is states
         self.chart.content = history.history_chart(states, self._curves if is_known else (), place)
 

@@ -52,6 +52,7 @@ class Viewer:
     """A running viewer.
 
     Attributes:
+        lock: Held while a page is served.
         scene: What is shown.
         subject: What it was made of.
         selections: What each page has selected.
@@ -71,25 +72,21 @@ class Viewer:
         Raises:
             UserError: No port is free.
         """
-        self._lock = threading.RLock()
+        self.lock = threading.RLock()
         self._server = start_server(port, self._go)
         self._cameras = Cameras(self._server)
         self._nodes = Nodes(self._server)
-        self._panel = Panel(self._server, self, self._lock)
-        self.selections = Selections(
-            self._server, self._panel.selection, lambda: self.drawing, self._lock, self._panel.say
-        )
+        self._panel = Panel(self)
+        self.selections = Selections(self, self._panel.selection)
         self.show_image = self.selections.show_image
         self._choices: dict[str, bool] = {}  # layers that the user has switched
         self._hidden: set[str] = set()  # ids of missions that the user has hidden
-        self._playback = Playback(self._server, self, self._lock, self._panel.say)
-        self._time_machine = TimeMachine(self._server, self.set_state, self._lock, self._panel.say)
-        self.court = Court(self._server, self, self._lock, self._panel.say)
-        self.motion = MotionRequest(self._server, self._lock)
-        self.links = Links(self._server, self, self._lock, self._panel.view, self._panel.say)
-        self._themes = Themes(
-            self._server, self._panel.view, self._lock, self._panel.say, is_dark=is_dark
-        )
+        self._playback = Playback(self)
+        self._time_machine = TimeMachine(self)
+        self.court = Court(self)
+        self.motion = MotionRequest(self._server, self.lock)
+        self.links = Links(self, self._panel.view)
+        self._themes = Themes(self, self._panel.view, is_dark=is_dark)
         self._drawing: Drawing | None = None
         self.scene: Scene | None = None
         self.subject: Subject | None = None
@@ -100,10 +97,18 @@ class Viewer:
         self._idle.set()
         self._is_stopped = False
         self._next_live = 0.0
-        self._server.scene.on_click()(by_user(self._lock, self._click, self._panel.say))
+        self._server.scene.on_click()(self.by_user(self._click))
         self._worker = threading.Thread(target=self._work, name="maplab viewer", daemon=True)
         self._worker.start()
         atexit.register(self.stop)
+
+    def by_user(self, action: Callable[[Any], None]) -> Callable[[Any], None]:
+        """Make a callback of what a page does; see `parts.by_user`."""
+        return by_user(self.lock, action, self.say)
+
+    def say(self, message: str) -> None:
+        """Show a message in all pages."""
+        self._panel.say(message)
 
     # -- what the console does --------------------------------------------------------------------
 
@@ -131,7 +136,7 @@ class Viewer:
     @property
     def wanted(self) -> Subject | None:
         """Subject that is shown, or soon will be."""
-        with self._lock:
+        with self.lock:
             return self._pending or self._building or self.subject
 
     @property
@@ -151,7 +156,7 @@ class Viewer:
         """
         drawing = make_checked_drawing(subject)
         scene = scene_of(drawing, subject)
-        with self._lock:
+        with self.lock:
             self._playback.configure(playback or PlaybackOptions())
             self._choices = {}
             self._show(subject, drawing, scene)
@@ -160,7 +165,7 @@ class Viewer:
 
     def follow(self, subject: Subject) -> None:
         """Show another state soon, without waiting for it; only the latest request counts."""
-        with self._lock:
+        with self.lock:
             self._pending = subject
             self._idle.clear()
         self._wake.set()
@@ -180,7 +185,7 @@ class Viewer:
         began = time.perf_counter()
         if began < self._next_live or self._pending is not None or not self.pages:
             return False
-        with self._lock:
+        with self.lock:
             if self._drawing is None or self.scene is None or self.player is not None:
                 return False
             scene = moved_scene(self.scene, self._drawing, make_map())
@@ -229,7 +234,7 @@ class Viewer:
         scene = self._shown()
         self.wait()
         layers = self.visible_layers
-        with self._lock, self._nodes.with_hidden(self._draw(scene), layers, self.visible_missions):
+        with self.lock, self._nodes.with_hidden(self._draw(scene), layers, self.visible_missions):
             try:
                 server, is_dark = self._server, self.is_dark
                 with states_to_choose(server, self.drawing, self.subject) as chooser:
@@ -245,7 +250,7 @@ class Viewer:
     def stop(self) -> None:
         """Stop the server; harmless when it has stopped already."""
         atexit.unregister(self.stop)
-        with self._lock:
+        with self.lock:
             if self._is_stopped:
                 return
             self._is_stopped = True
@@ -294,13 +299,13 @@ class Viewer:
 
     def set_layer(self, name: str, is_visible: bool) -> None:
         """Show or hide a layer."""
-        with self._lock:
+        with self.lock:
             self._choices[name] = is_visible
             self.redraw()
 
     def set_layers(self, visible: set[str]) -> set[str]:
         """Show these layers and no others; return those that the map has not."""
-        with self._lock:
+        with self.lock:
             names = set(self._shown().names)
             self._choices |= {name: name in visible for name in names}
             self.redraw()
@@ -308,14 +313,14 @@ class Viewer:
 
     def set_missions(self, visible: set[str]) -> None:
         """Show these missions and no others."""
-        with self._lock:
+        with self.lock:
             self._hidden = {mission.id for mission in self._shown().missions} - visible
             self._playback.stop()
             self.redraw()
 
     def set_colouring(self, colouring: str, only_mission: str = "") -> None:
         """Colour landmarks by another rule, all or those of a mission (id) alone."""
-        with self._lock:
+        with self.lock:
             if self.subject is None:
                 return
             options = self.subject.options.with_colouring(colouring, only_mission)
@@ -323,7 +328,7 @@ class Viewer:
 
     def set_refused_reason(self, reason: str) -> None:
         """Show refused closures whose reason contains a text only, empty = all."""
-        with self._lock:
+        with self.lock:
             if self.subject is None:
                 return
             options = dataclasses.replace(self.subject.options, refused_closures_reason=reason)
@@ -332,24 +337,24 @@ class Viewer:
 
     def set_state(self, place: int) -> None:
         """Show a state of the map by its place in the undo history; the map stays as it is."""
-        with self._lock:
+        with self.lock:
             subject = self.wanted
             if subject is not None and 0 <= place < len(subject.history):
                 self.follow(subject.at_state(place, swipes=self._time_machine.swipes))
 
     def set_point_scale(self, factor: float) -> None:
         """Draw points larger or smaller."""
-        with self._lock:
+        with self.lock:
             self._nodes.scale_points(factor)
 
     def set_dark(self, is_dark: bool) -> None:
         """Change the theme of all pages."""
-        with self._lock:
+        with self.lock:
             self._themes.set_all(is_dark=is_dark)
 
     def set_ground(self, is_visible: bool) -> None:
         """Show or hide the grid."""
-        with self._lock:
+        with self.lock:
             self._nodes.set_ground_visible(is_visible)
 
     def look(self, client: Any, view: str) -> None:
@@ -367,12 +372,12 @@ class Viewer:
 
     def set_step(self, step: int) -> None:
         """Show the map as it was after a step; the last step is the whole map."""
-        with self._lock:
+        with self.lock:
             self._playback.set_step(step)
 
     def set_playing(self, is_playing: bool) -> None:
         """Play or pause; playing from the end starts again at the beginning."""
-        with self._lock:
+        with self.lock:
             self._playback.set_playing(is_playing)
 
     @property
@@ -380,29 +385,16 @@ class Viewer:
         """The time line, and what it plays."""
         return self._playback
 
-    def set_ride(self, ride: str) -> None:
-        """Let the view ride along with the plotted mission, one of `camera.RIDES`."""
-        with self._lock:
-            self._playback.set_ride(ride)
-
     def open_time_line(self) -> None:
         """Open the window of the time line."""
-        with self._lock:
+        with self.lock:
             self._playback.time_line.open()
 
     # -- picking ----------------------------------------------------------------------------------
 
-    def set_measuring(self, is_measuring: bool) -> None:
-        """Measure between the picks of each page."""
-        self.selections.set_measuring(is_measuring)
-
-    def clear_pick(self) -> None:
-        """Forget what was picked in any page."""
-        self.selections.clear()
-
     def select(self, picked: picking.Pick) -> None:
         """Mark a thing and show its facts in all pages, as if it had been clicked in each."""
-        with self._lock:
+        with self.lock:
             self.selections.pick(self.drawing, picked)
 
     def fly_to(self, text: str) -> None:
@@ -411,7 +403,7 @@ class Viewer:
         Raises:
             UserError: Nothing has an id that starts so, or several have.
         """
-        with self._lock:
+        with self.lock:
             picked = self.selections.jump(self.drawing, text)
             for page in self._server.get_clients().values():
                 fly(page, self.drawing, picked)
@@ -436,14 +428,14 @@ class Viewer:
         while not self._is_stopped:
             self._wake.wait()
             self._wake.clear()
-            with self._lock:
+            with self.lock:
                 subject, self._pending = self._pending, None
                 self._building = subject
             if subject is not None and not self._is_stopped:
                 self._show_safely(subject)
             if not self._is_stopped:
                 self._time_machine.measure()
-            with self._lock:
+            with self.lock:
                 self._building = None
                 if self._pending is None:
                     self._idle.set()
@@ -452,15 +444,15 @@ class Viewer:
         try:
             drawing = make_checked_drawing(subject)
             scene = scene_of(drawing, subject)
-            with self._lock:
+            with self.lock:
                 if not self._is_stopped:
                     self._show(subject, drawing, scene)
         except MaplabError as error:
-            with self._lock:
+            with self.lock:
                 self._panel.say(str(error))
         except Exception:
             logger.exception("the viewer could not follow the map")
-            with self._lock:
+            with self.lock:
                 self._panel.say(
                     "this state of the map cannot be shown: the log file has the reason"
                 )

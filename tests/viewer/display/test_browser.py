@@ -49,8 +49,8 @@ def running() -> Iterator[Viewer]:
 def viewer(running: Viewer) -> Viewer:
     """The viewer as it is at first."""
     running.set_dark(False)
-    running.set_measuring(False)
-    running.clear_pick()
+    running.selections.set_measuring(False)
+    running.selections.clear()
     running.show(SUBJECT, playback=PlaybackOptions(steps=20))
     running.look_at_everything()
     return running
@@ -142,7 +142,7 @@ def test_a_click_picks_the_vertex_under_it(page: Page, viewer: Viewer) -> None:
 
 def test_two_picks_measure_a_distance(page: Page, viewer: Viewer) -> None:
     viewer.set_layer("loop_closures", False)
-    viewer.set_measuring(True)
+    viewer.selections.set_measuring(True)
     for row in (2, 11):
         page.page.mouse.click(*place_on_page(viewer, MAP.T_G_I[row, 4:]))
         assert page.wait_until(

@@ -83,7 +83,7 @@ def test_a_link_opens_the_view_that_was_copied(viewer: Viewer) -> None:
     assert len(page.link) < 200
 
     viewer.show(Subject(MAP.replace(), "of another name"))
-    viewer.clear_pick()
+    viewer.selections.clear()
     assert "landmarks" in viewer.visible_layers
     opened = FakePage(page.link)
     opened.position, opened.look_at = np.ones((2, 3))
@@ -176,7 +176,7 @@ def test_an_address_of_an_id_selects_it(viewer: Viewer) -> None:
     shared = read_link(page.split("/#")[1].split("'")[0])
     assert shared.picked_id == id_
     np.testing.assert_allclose(shared.camera_G[1], MAP.p_G[3], atol=1e-3)
-    viewer.clear_pick()
+    viewer.selections.clear()
     for headers in ({"Sec-Fetch-Site": "cross-site"}, {"Host": f"evil.example:{viewer.port}"}):
         assert _open(f"{viewer.url}/go/{id_}", **headers)[0] == 403
     assert viewer.selection.picked is None
