@@ -3,7 +3,12 @@
 A map file holds them as length-delimited protobuf fields: programs that do not know them skip them.
 """
 
+import functools
 import zlib
+from typing import Any
+
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from google.protobuf.message import DecodeError
 
 from maplab_py.errors import MapError
 from maplab_py.input_files import DEFAULT_MAX_BYTES, TooLarge, inflate, inflated_size
@@ -15,7 +20,27 @@ PACKED = b"LC1"
 RECORD_SHARE = 4
 """Maximum unpacked size of a record as a fraction of the bound; reading copies its tables."""
 _ZLIB = 15
-_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
+
+
+@functools.cache
+def _message_type(number: int) -> Any:
+    """Return the type of messages that know one field of bytes by its number; they keep the others."""
+    kind = f"Extension{number}"
+    file = descriptor_pb2.FileDescriptorProto(name=f"{kind}.proto")
+    field = descriptor_pb2.FieldDescriptorProto
+    file.message_type.add(name=kind).field.add(
+        name="content", number=number, type=field.TYPE_BYTES, label=field.LABEL_OPTIONAL
+    )
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName(kind))
+
+
+def _parsed(unknown: bytes, number: int) -> Any:
+    try:
+        return _message_type(number).FromString(unknown)
+    except DecodeError:
+        raise MapError("the extra fields of an entry are damaged") from None
 
 
 def read_extension(unknown: bytes, number: int) -> bytes | None:
@@ -24,11 +49,8 @@ def read_extension(unknown: bytes, number: int) -> bytes | None:
     Raises:
         MapError: The bytes are not protobuf fields.
     """
-    content = None
-    for field, wire_type, _, begin, end in _fields(unknown):
-        if field == number and wire_type == _BYTES:
-            content = unknown[begin:end]
-    return content
+    message = _parsed(unknown, number)
+    return message.content if message.HasField("content") else None
 
 
 def with_extension(unknown: bytes, number: int, content: bytes | None) -> bytes:
@@ -37,12 +59,11 @@ def with_extension(unknown: bytes, number: int, content: bytes | None) -> bytes:
     Raises:
         MapError: The bytes are not protobuf fields.
     """
-    kept = b"".join(
-        unknown[first:end] for field, _, first, _, end in _fields(unknown) if field != number
+    message = _parsed(unknown, number)
+    message.ClearField("content")
+    return bytes(
+        message.SerializeToString() + _message_type(number)(content=content).SerializeToString()
     )
-    if content is None:
-        return kept
-    return kept + _varint(number << 3 | _BYTES) + _varint(len(content)) + content
 
 
 def unpacked(content: bytes, max_bytes: int = DEFAULT_MAX_BYTES) -> bytearray:
@@ -72,46 +93,3 @@ def packed_size(content: bytes, max_bytes: int) -> int:
         return inflated_size(memoryview(content)[len(PACKED) :], max_bytes, wbits=_ZLIB)
     except (EOFError, zlib.error):
         return 0
-
-
-def _fields(unknown: bytes) -> list[tuple[int, int, int, int, int]]:
-    """Return number, wire type, first byte, begin and end of the content of every field."""
-    fields, place = [], 0
-    try:
-        while place < len(unknown):
-            first = place
-            tag, place = _read_varint(unknown, place)
-            wire_type, begin = tag & 7, place
-            if wire_type == _VARINT:
-                _, place = _read_varint(unknown, place)
-            elif wire_type == _BYTES:
-                size, begin = _read_varint(unknown, place)
-                place = begin + size
-            else:
-                place += {_FIXED64: 8, _FIXED32: 4}[wire_type]
-            if place > len(unknown):
-                raise IndexError
-            fields.append((tag >> 3, wire_type, first, begin, place))
-    except (IndexError, KeyError):
-        raise MapError("the extra fields of an entry are damaged") from None
-    return fields
-
-
-def _read_varint(data: bytes, place: int) -> tuple[int, int]:
-    value = shift = 0
-    while True:
-        byte = data[place]
-        place += 1
-        value |= (byte & 0x7F) << shift
-        shift += 7
-        if byte < 0x80:
-            return value, place
-
-
-def _varint(value: int) -> bytes:
-    out = bytearray()
-    while value >= 0x80:
-        out.append(value & 0x7F | 0x80)
-        value >>= 7
-    out.append(value)
-    return bytes(out)

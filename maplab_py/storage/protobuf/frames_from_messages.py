@@ -207,11 +207,6 @@ def _descriptors(
         raise MapError(f"{name(place)}: {error}; {map_files.COPY_AGAIN}") from error
 
 
-def _descriptor_table(table: tables.Frames, max_bytes: int) -> NDArray[np.uint8]:
-    """Return zeros (K, widest) for the descriptors; every row is as wide as the widest."""
-    return np.zeros(check_descriptor_table(table, max_bytes), dtype=np.uint8)
-
-
 def check_descriptor_table(table: tables.Frames, max_bytes: int) -> tuple[int, int]:
     """Return the shape (K, widest) of the table of descriptors.
 
@@ -256,7 +251,7 @@ def _with_keypoints(
         "sigma_px": np.full(total, 0.8),
         "scale": np.zeros(total),
         "track_id": np.full(total, -1, dtype=np.int32),
-        "descriptor": _descriptor_table(table, max_bytes),
+        "descriptor": np.zeros(check_descriptor_table(table, max_bytes), dtype=np.uint8),
         "position_3d": np.zeros((total, 0)),
         "time_offset_ns": np.zeros((total, 0), dtype=np.int32),
     }

@@ -25,48 +25,33 @@ _MAX_LABELLED_MISSIONS = 8
 
 def trajectories(drawing: Drawing) -> Layer:
     """Lines through the vertices of each mission, in its colour or by time."""
-    if drawing.options.color_paths_by_time:
-        return _paths_by_time(drawing)
-    mission = drawing.vi_map.vertices.mission
+    mission, p = drawing.vi_map.vertices.mission, drawing.p_vertices
     start = np.flatnonzero(mission[1:] == mission[:-1])
-    p = drawing.p_vertices
+    colour, legend = _vertex_colours(drawing)
     parts: dict[str, Part] = {}
     for mission_id, members in drawing.by_mission(mission[start]):
         rows = start[members]
-        colour = drawing.mission_colours[mission[rows[0]]]
-        parts[mission_id] = make_segments(p[rows], p[rows + 1], colour, rows, 3.0)
-    return Layer("trajectories", "Trajectories", parts, len(drawing.vi_map.missions))
+        parts[mission_id] = make_segments(p[rows], p[rows + 1], colour[rows], rows, 3.0)
+    count = len(drawing.vi_map.missions)
+    return Layer("trajectories", "Trajectories", parts, count, legend=legend)
 
 
-def _paths_by_time(drawing: Drawing) -> Layer:
-    vi_map, p = drawing.vi_map, drawing.p_vertices
-    mission = vi_map.vertices.mission
-    start = np.flatnonzero(mission[1:] == mission[:-1])
-    colour, low, high = _time_colours(drawing)
-    parts: dict[str, Part] = {
-        mission_id: make_segments(
-            p[start[members]], p[start[members] + 1], colour[start[members]], start[members], 3.0
-        )
-        for mission_id, members in drawing.by_mission(mission[start])
-    }
-    codes = tuple(colours.hex_codes(colours.SEQUENTIAL))
-    legend = LegendEntry("time of the path", codes, f"{low:.0f} s", f"{high:.0f} s")
-    return Layer("trajectories", "Trajectories", parts, len(vi_map.missions), legend=(legend,))
-
-
-def _time_colours(drawing: Drawing) -> tuple[U8, float, float]:
-    """Return a colour (V, 3) for each vertex by the time since its mission began, and the range [s]."""
+def _vertex_colours(drawing: Drawing) -> tuple[U8, tuple[LegendEntry, ...]]:
+    """Return a colour (V, 3) for each vertex, of its mission or by the time since that began."""
     table, start = drawing.vi_map.vertices, drawing.vi_map.vertex_start
+    if not drawing.options.color_paths_by_time:
+        return drawing.mission_colours[table.mission], ()
     since_ns = table.timestamp_ns - table.timestamp_ns[start[table.mission]]
     part, low, high = colours.normalised(np.asarray(1e-9 * since_ns, dtype=np.float64))
-    return colours.ramp(part, colours.SEQUENTIAL), low, high
+    codes = tuple(colours.hex_codes(colours.SEQUENTIAL))
+    legend = LegendEntry("time of the path", codes, f"{low:.0f} s", f"{high:.0f} s")
+    return colours.ramp(part, colours.SEQUENTIAL), (legend,)
 
 
 def vertices(drawing: Drawing) -> Layer:
     """A dot for each vertex, in the colour of the path."""
     mission = drawing.vi_map.vertices.mission
-    is_by_time = drawing.options.color_paths_by_time
-    colour = _time_colours(drawing)[0] if is_by_time else drawing.mission_colours[mission]
+    colour, _ = _vertex_colours(drawing)
     parts: dict[str, Part] = {}
     for mission_id, rows in drawing.by_mission(mission):
         parts[mission_id] = make_points(
