@@ -6,6 +6,7 @@ names and published together: a command that fails or is cancelled leaves no fil
 """
 
 import dataclasses
+import functools
 import os
 import stat
 from collections.abc import Iterable, Iterator
@@ -16,6 +17,8 @@ from pathlib import Path
 from maplab_py.atomic import PendingFile, files, replaced_file
 from maplab_py.cancellation import cleaned_up
 from maplab_py.errors import UserError
+
+_CHUNK_BYTES = 1 << 20
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,6 +156,13 @@ def check_writable(path: Path, *, overwrite: bool) -> None:
         raise UserError(f"{path} is neither a file nor a folder: name a file")
     if not overwrite:
         raise UserError(f"{path} exists already: give --overwrite to replace it")
+
+
+def copy_file(source: Path, target: Path, *, overwrite: bool = False) -> None:
+    """Write the content of another file, as one that a library has made; raises UserError."""
+    with source.open("rb") as stream:
+        chunks = iter(functools.partial(stream.read, _CHUNK_BYTES), b"")
+        write_bytes(target, chunks, overwrite=overwrite)
 
 
 def write_text(path: Path, chunks: Iterable[str], *, overwrite: bool = False) -> None:

@@ -341,7 +341,7 @@ def _read(path: Path) -> Parts | SensorSet:
     for is_format, read in _FORMATS:
         if is_format(entry):
             return read(entry)
-    if _is_maplab(entry):
+    if "sensors" in entry or "cameras" in entry or "sigmas" in entry or "imu_sigmas" in entry:
         return sensors_of(entry.content, str(path))
     raise UserError(f"{path}: the format is not known: {KNOWN_FORMATS}")
 
@@ -384,10 +384,6 @@ def _read_openvins(entry: Entry, folder: Path) -> Parts:
     )
     cameras, inertial = read_camera_chain(read_entry(chain)), read_kalibr_imu(read_entry(imu))
     return dataclasses.replace(_joined(cameras, inertial, imu), format="OpenVINS")
-
-
-def _is_maplab(entry: Entry) -> bool:
-    return "sensors" in entry or "cameras" in entry or "sigmas" in entry or "imu_sigmas" in entry
 
 
 def _has_imu_noise(entry: Entry) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.errors import MapError
-from maplab_py.geometry import se3, so3
+from maplab_py.geometry import interpolation, se3, so3
 from maplab_py.input_files import LARGEST, read_text
 from maplab_py.report import counted
 from maplab_py.sensors.yaml_text import parse_yaml
@@ -51,9 +51,6 @@ def read_external_closures(vi_map: VIMap, path: Path) -> tuple[LoopClosureEdges,
             switch[i] = float(entry["switch_variable"]), float(entry["switch_variable_variance"])
             if not all(np.isfinite(v[i]).all() for v in (T_G_S, T_S_T, covariance, switch)):
                 raise ValueError("a number is not finite")
-            values = (T_G_S[i], T_S_T[i], covariance[i], switch[i])
-            if not all(np.isfinite(part).all() for part in values):
-                raise ValueError("has entries that are not finite numbers")
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             what = f"'{error.args[0]}' is missing" if isinstance(error, KeyError) else str(error)
             raise MapError(f"{path}: entry {i + 1}: {what}") from None
@@ -104,10 +101,5 @@ def _nearest(vi_map: VIMap, time_ns: I64) -> tuple[I64, NDArray[np.bool_]]:
     times = vi_map.vertices.timestamp_ns[order]
     if len(times) == 0:
         return np.zeros(time_ns.shape, dtype=np.int64), np.zeros(time_ns.shape, dtype=np.bool_)
-    after = np.clip(np.searchsorted(times, time_ns), 1, max(len(times) - 1, 1))
-    after = np.minimum(after, len(times) - 1)
-    before = np.maximum(after - 1, 0)
-    closer = np.where(
-        np.abs(times[after] - time_ns) < np.abs(times[before] - time_ns), after, before
-    )
+    closer = interpolation.nearest_rows(times, time_ns)
     return order[closer], np.abs(times[closer] - time_ns) <= _MAX_TIME_NS

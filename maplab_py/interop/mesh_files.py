@@ -12,6 +12,8 @@ from maplab_py.input_files import DEFAULT_MAX_BYTES, read_bytes
 from maplab_py.interop.ply import PlyCloud, encode_ply, parse_ply
 from maplab_py.output_files import write_bytes
 
+_SUFFIXES = (".ply", ".obj", ".stl", ".glb")
+
 
 def check_mesh_path(path: Path) -> None:
     """Check that a file has the suffix of a mesh.
@@ -19,8 +21,8 @@ def check_mesh_path(path: Path) -> None:
     Raises:
         UserError: It has another one.
     """
-    if path.suffix.lower() not in _ENCODERS:
-        raise UserError(f"{path}: a mesh is written as {', '.join(_ENCODERS)}: choose one of them")
+    if path.suffix.lower() not in _SUFFIXES:
+        raise UserError(f"{path}: a mesh is written as {', '.join(_SUFFIXES)}: choose one of them")
 
 
 def write_mesh(
@@ -39,7 +41,7 @@ def write_mesh(
         UserError: The suffix is another one, or the file cannot be written.
     """
     check_mesh_path(path)
-    write_bytes(path, _ENCODERS[path.suffix.lower()](p, faces, colours), overwrite=overwrite)
+    write_bytes(path, _encoded(path.suffix.lower(), p, faces, colours), overwrite=overwrite)
 
 
 def read_mesh(path: Path) -> PlyCloud:
@@ -51,11 +53,7 @@ def read_mesh(path: Path) -> PlyCloud:
     """
     kind = path.suffix.lower()
     data = read_bytes(path, DEFAULT_MAX_BYTES, remedy="reduce the mesh", error=MapError)
-    mesh = (
-        _parsed(data, kind, path)
-        if kind in (".obj", ".stl", ".glb")
-        else parse_ply(data, str(path))
-    )
+    mesh = _parsed(data, kind, path) if kind in _SUFFIXES[1:] else parse_ply(data, str(path))
     if mesh.faces is None or not len(mesh.faces):
         raise MapError(f"{path} has no triangles: give a mesh")
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.p):
@@ -74,7 +72,7 @@ def _parsed(data: bytes, kind: str, path: Path) -> PlyCloud:
         faces = np.asarray(content.faces, dtype=np.int32).reshape(-1, 3)
         colours = content.visual.vertex_colors[:, :3] if content.visual.kind == "vertex" else None
     except Exception as error:
-        remedy = f"write it again, as one of {', '.join(_ENCODERS)}"
+        remedy = f"write it again, as one of {', '.join(_SUFFIXES)}"
         raise MapError(
             f"{path}: is damaged, or no mesh in the format of its name: {remedy}"
         ) from error
@@ -85,29 +83,13 @@ def _parsed(data: bytes, kind: str, path: Path) -> PlyCloud:
     return PlyCloud(p, None if colours is None else np.array(colours, dtype=np.uint8), faces=faces)
 
 
-def _ply(p: F64, faces: I32, colours: U8 | None) -> list[bytes]:
-    return encode_ply(PlyCloud(p, colours, faces=faces))
-
-
-def _obj(p: F64, faces: I32, colours: U8 | None) -> list[bytes]:
-    return _export("obj", p, faces, colours)
-
-
-def _stl(p: F64, faces: I32, colours: U8 | None) -> list[bytes]:
-    return _export("stl", p, faces, colours)
-
-
-def _glb(p: F64, faces: I32, colours: U8 | None) -> list[bytes]:
-    """Return a glTF scene; its axes are y up, so that the mesh is turned about x."""
-    return _export("glb", np.stack([p[:, 0], p[:, 2], -p[:, 1]], axis=1), faces, colours)
-
-
-def _export(kind: str, p: F64, faces: I32, colours: U8 | None) -> list[bytes]:
+def _encoded(kind: str, p: F64, faces: I32, colours: U8 | None) -> list[bytes]:
     import trimesh
 
+    if kind == ".ply":
+        return encode_ply(PlyCloud(p, colours, faces=faces))
+    if kind == ".glb":  # axes are y up, so that the mesh is turned about x
+        p = np.stack([p[:, 0], p[:, 2], -p[:, 1]], axis=1)
     mesh = trimesh.Trimesh(p, faces, vertex_colors=colours, process=False, validate=False)
-    content = mesh.export(file_type=kind)
+    content = mesh.export(file_type=kind[1:])
     return [content.encode() if isinstance(content, str) else bytes(content)]
-
-
-_ENCODERS = {".ply": _ply, ".obj": _obj, ".stl": _stl, ".glb": _glb}

@@ -3,6 +3,8 @@
 Source: Greg Turk, The PLY Polygon File Format, 1994.
 """
 
+from __future__ import annotations
+
 import dataclasses
 from pathlib import Path
 from typing import Any
@@ -25,7 +27,14 @@ _BYTES_PER_POINT = 110
 """Memory of a point [bytes] while columns are read and concatenated."""
 _TEXT_PARTS = 60
 """Memory of the words of an ascii file per byte of the file."""
-_INTENSITIES = ("intensity", "scalar_intensity", "scalar_Intensity", "i")
+INTENSITIES = (
+    "intensity",
+    "scalar_intensity",
+    "scalar_Intensity",
+    "i",
+    "intensities",
+    "reflectivity",
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -36,6 +45,12 @@ class PlyCloud:
     colours: U8 | None = None  # (N, 3)
     intensity: F64 | None = None  # (N,)
     faces: NDArray[np.int32] | None = None  # (F, 3)
+
+    def where(self, rows: Any) -> PlyCloud:
+        """Return the points where a mask (N,) is set, without faces."""
+        colours = None if self.colours is None else self.colours[rows]
+        intensity = None if self.intensity is None else self.intensity[rows]
+        return PlyCloud(self.p[rows], colours, intensity)
 
 
 class EmptyCloud(MapError):
@@ -79,11 +94,16 @@ def parse_ply(data: bytes, source: str, max_bytes: int = DEFAULT_MAX_BYTES) -> P
         raise MapError(f"{source}: the PLY data end early or do not fit ({error})") from None
     if vertices is None or not {"x", "y", "z"} <= set(vertices.dtype.names or ()):
         raise MapError(f"{source}: the PLY file has no vertices with x, y, z")
-    names = vertices.dtype.names or ()
+    return dataclasses.replace(cloud_of_table(vertices), faces=faces)
+
+
+def cloud_of_table(table: NDArray[np.void]) -> PlyCloud:
+    """Return the points of a table with the columns x, y, z, and its intensities and colours."""
+    names = table.dtype.names or ()
     with np.errstate(invalid="ignore"):  # signalling NaN
-        p = np.stack([vertices[n].astype(np.float64) for n in ("x", "y", "z")], axis=1)
-        intensity = next((vertices[n].astype(np.float64) for n in _INTENSITIES if n in names), None)
-        return PlyCloud(p, _colours(vertices), intensity, faces)
+        p = np.stack([table[n].astype(np.float64) for n in ("x", "y", "z")], axis=1)
+        intensity = next((table[n].astype(np.float64) for n in INTENSITIES if n in names), None)
+        return PlyCloud(p, _colours(table), intensity)
 
 
 def _header(data: bytes, source: str) -> tuple[str, list[_Element], int]:
@@ -164,15 +184,19 @@ def _read_ascii(
     return vertices, faces
 
 
-def _colours(vertices: NDArray[np.void]) -> U8 | None:
-    names = vertices.dtype.names or ()
+def _colours(table: NDArray[np.void]) -> U8 | None:
+    names = table.dtype.names or ()
     for triple in (("red", "green", "blue"), ("r", "g", "b")):
         if set(triple) <= set(names):
-            columns = np.stack([vertices[name] for name in triple], axis=1)
+            columns = np.stack([table[name] for name in triple], axis=1)
             if columns.dtype.kind == "f":
                 columns = np.round(255.0 * np.clip(np.nan_to_num(columns), 0.0, 1.0))
             return columns.astype(np.uint8)
-    return None
+    packed = next((table[name] for name in ("rgb", "rgba") if name in names), None)
+    if packed is None or packed.dtype.itemsize != 4:  # PCL packs bytes into a number
+        return None
+    words = np.ascontiguousarray(packed.astype(packed.dtype.newbyteorder("="))).view(np.uint32)
+    return np.stack([words >> 16, words >> 8, words], axis=1).astype(np.uint8)
 
 
 def write_ply(cloud: PlyCloud, path: Path, *, overwrite: bool = True) -> None:

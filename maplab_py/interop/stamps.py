@@ -1,8 +1,8 @@
 """Time stamps written as text: exact nanoseconds, in a unit that is known, concluded, or asked for.
 
 The unit is that of `--time_unit`, else of the header, else the only one that makes a file of its kind
-plausible: rows as far apart as such sensors deliver them, a date of this century, times in common with
-what is recorded beside it. Where several units remain, or none, the file is refused.
+plausible: rows as far apart as such sensors deliver them, a date of this century. Where several units
+remain, or none, the file is refused.
 """
 
 import dataclasses
@@ -96,7 +96,6 @@ def parse_stamps(
     unit: str = "",
     header: str = "",
     custom: str = "ns",
-    span_ns: tuple[int, int] | None = None,
 ) -> Stamps:
     """Return the times of stamps.
 
@@ -108,7 +107,6 @@ def parse_stamps(
         unit: Unit of all stamps, from --time_unit; empty = concluded.
         header: Name of the column, which may tell the unit.
         custom: Unit that the format prescribes where nothing is written.
-        span_ns: First and last time of what was recorded beside it.
 
     Raises:
         MapError: A token is no number, a time is beyond 64 bits, digits are lost, or the unit is open.
@@ -121,7 +119,7 @@ def parse_stamps(
     possible = [name for name in fitting if _is_within(numbers.step_s(name), kind.possible_s)]
     if named in possible or (named in fitting and _is_kept(numbers.step_s(named), kind, possible)):
         return Stamps(numbers.times_ns(named), named)
-    concluded = _concluded(numbers, kind, possible, custom, span_ns)
+    concluded = _concluded(numbers, kind, possible, custom)
     if not concluded:
         raise MapError(numbers.open_unit(kind, named, fitting))
     times_ns = numbers.times_ns(concluded)
@@ -246,12 +244,6 @@ class _Numbers:
         """Return whether the times are dates of this century."""
         return _is_within(self._usual * 10.0 ** (UNITS[unit] - 9), _CALENDAR_S)
 
-    def overlaps(self, unit: str, span_ns: tuple[int, int]) -> bool:
-        """Return whether the times have some in common with a span."""
-        scale = 10 ** UNITS[unit]
-        first, last = int(self._whole.min()) * scale, (int(self._whole.max()) + 1) * scale
-        return bool(first <= span_ns[1] and last >= span_ns[0])
-
     def open_unit(self, kind: StampKind, named: str, fitting: list[str]) -> str:
         """Return the message that the unit remains open."""
         if len(self._tokens) == 1 or not self._step:
@@ -279,24 +271,18 @@ def _is_kept(step_s: float, kind: StampKind, possible: list[str]) -> bool:
     return not step_s or not possible or (kind is not IMU and _is_within(step_s, _ANY_STEP_S))
 
 
-def _concluded(
-    numbers: _Numbers,
-    kind: StampKind,
-    possible: list[str],
-    custom: str,
-    span_ns: tuple[int, int] | None,
-) -> str:
+def _concluded(numbers: _Numbers, kind: StampKind, possible: list[str], custom: str) -> str:
     """Return the unit that alone is plausible; empty if it remains open."""
     custom = "s" if numbers.has_fractions else custom
     fitting = [name for name in UNITS if numbers.fits(name)]
     if len(fitting) == 1 or not numbers.step_s("s"):
-        return _single_unit(numbers, fitting, custom, span_ns)
+        # of a single time: the format's unit, unless the date would be another
+        if len(fitting) == 1:
+            return fitting[0]
+        dated = [name for name in fitting if numbers.is_calendar_time(name)]
+        return custom if custom in fitting and (not dated or custom in dated) else ""
     typical = [name for name in possible if _is_within(numbers.step_s(name), kind.typical_s)]
     dated = [name for name in possible if numbers.is_calendar_time(name)]
-    if span_ns is not None:
-        common = [name for name in possible if numbers.overlaps(name, span_ns)]
-        if len(common) == 1:
-            return common[0]
     both = [name for name in typical if name in dated]
     if len(both) == 1:
         return both[0]
@@ -305,20 +291,6 @@ def _concluded(
     if len(dated) == 1:
         return dated[0] if not typical else ""
     return typical[0] if len(typical) == 1 and custom not in possible else ""
-
-
-def _single_unit(
-    numbers: _Numbers, fitting: list[str], custom: str, span_ns: tuple[int, int] | None
-) -> str:
-    """Return the unit of a single time: the format's, unless the date would be another."""
-    if len(fitting) == 1:
-        return fitting[0]
-    if span_ns is not None:
-        common = [name for name in fitting if numbers.overlaps(name, span_ns)]
-        if len(common) == 1:
-            return common[0]
-    dated = [name for name in fitting if numbers.is_calendar_time(name)]
-    return custom if custom in fitting and (not dated or custom in dated) else ""
 
 
 def _is_within(value: float, bounds: tuple[float, float]) -> bool:

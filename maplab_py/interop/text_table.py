@@ -118,13 +118,7 @@ class TextTable(Rows):
         return np.asarray(self.values[:, places] * factors)
 
 
-def read_text_table(
-    path: Path,
-    kind: StampKind = POSES,
-    *,
-    unit: str = "",
-    span_ns: tuple[int, int] | None = None,
-) -> TextTable:
+def read_text_table(path: Path, kind: StampKind = POSES, *, unit: str = "") -> TextTable:
     """Read a table separated by commas or white space, with `#` comments and an optional header.
 
     The names of the columns may stand in any line that has as many words as the rows.
@@ -132,14 +126,13 @@ def read_text_table(
     Args:
         kind: Kind of its rows, which bounds the distances between their stamps.
         unit: Unit of the stamps, from --time_unit; empty = concluded.
-        span_ns: First and last time of what was recorded beside it.
 
     Raises:
         MapError: The file cannot be read, is empty, the unit of the stamps is open, or a line is not a
             row of numbers like the first one; names file and line.
     """
     text = read_foreign_text(path, _MAX_BYTES)
-    return parse_text_table(text, str(path), kind, unit=unit, span_ns=span_ns)
+    return parse_text_table(text, str(path), kind, unit=unit)
 
 
 def parse_text_table(
@@ -148,7 +141,6 @@ def parse_text_table(
     kind: StampKind = POSES,
     *,
     unit: str = "",
-    span_ns: tuple[int, int] | None = None,
     allow_nan: bool = False,
 ) -> TextTable:
     """Parse the text of a table; `source` is its name in error messages, see `read_text_table`.
@@ -203,7 +195,6 @@ def parse_text_table(
         unit=unit,
         header=time_name,
         custom="ns" if has_commas else "s",
-        span_ns=span_ns,
     )
     cells = [row[1:] for row in rows]
     if allow_nan:

@@ -6,7 +6,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.errors import MapError
-from maplab_py.interop.ply import EmptyCloud, PlyCloud
+from maplab_py.interop.ply import EmptyCloud, PlyCloud, cloud_of_table
 from maplab_py.interop.recordings.bag_files import message_types
 from maplab_py.sensors import Camera, Distortion, Projection
 
@@ -35,7 +35,6 @@ _POINT_TYPES = {
     _FLOAT64: "f8",
 }
 """numpy's names of the data types of sensor_msgs/PointField."""
-_INTENSITIES = ("intensity", "intensities", "i", "reflectivity")
 _MAX_POINTS = 50_000_000
 _FARTHEST_MEDIAN_M = 1000.0
 """Distances whose median is larger are in millimetres."""
@@ -218,34 +217,17 @@ def cloud_of(message: Any, name: str) -> PlyCloud:
         rows = data[: row_bytes * int(message.height)].reshape(int(message.height), row_bytes)
         packed = np.ascontiguousarray(rows[:, : int(message.width) * step])
         table = packed.reshape(-1).view(dtype)
-        p = np.stack([table[axis].astype(np.float64) for axis in ("x", "y", "z")], axis=1)
+        cloud = cloud_of_table(table)
     except (ValueError, KeyError) as error:
         raise MapError(
             f"{name}: the cloud is damaged ({error}): leave its time out, or record it again"
         ) from error
-    valid: NDArray[np.bool_] = np.all(np.isfinite(p), axis=1)
+    valid: NDArray[np.bool_] = np.all(np.isfinite(cloud.p), axis=1)
     if not valid.any():
         raise EmptyCloud(f"{name}: the cloud is empty: leave its time out, or record it again")
-    if float(np.median(np.linalg.norm(p[valid], axis=1))) > _FARTHEST_MEDIAN_M:
+    if float(np.median(np.linalg.norm(cloud.p[valid], axis=1))) > _FARTHEST_MEDIAN_M:
         raise MapError(
             f"{name}: half of the points are beyond {_FARTHEST_MEDIAN_M:g} m: coordinates are in "
             "metres; record them so"
         )
-    return PlyCloud(p[valid], _colours(table, valid), _intensity(table, valid))
-
-
-def _intensity(table: NDArray[np.void], valid: NDArray[np.bool_]) -> NDArray[np.float64] | None:
-    names = table.dtype.names or ()
-    name = next((name for name in _INTENSITIES if name in names), None)
-    return None if name is None else table[name][valid].astype(np.float64)
-
-
-def _colours(table: NDArray[np.void], valid: NDArray[np.bool_]) -> NDArray[np.uint8] | None:
-    names = table.dtype.names or ()
-    name = next((name for name in ("rgb", "rgba") if name in names), None)
-    if name is None or table[name].dtype.itemsize != np.dtype(np.uint32).itemsize:
-        return None
-    words = np.ascontiguousarray(table[name][valid])
-    order = words.dtype.newbyteorder("=")
-    packed = words.astype(order).view(np.uint32)
-    return np.stack([packed >> 16, packed >> 8, packed], axis=1).astype(np.uint8)
+    return cloud.where(valid)

@@ -15,17 +15,7 @@ from maplab_py.compilation import compiled
 from maplab_py.errors import MapError
 from maplab_py.geometry import so3
 from maplab_py.input_files import read_bytes
-from maplab_py.interop.colmap.model import (
-    MODELS,
-    ColmapCamera,
-    ColmapFrames,
-    ColmapImages,
-    ColmapModel,
-    ColmapPoints,
-    ColmapRig,
-    Sensor,
-    SensorType,
-)
+from maplab_py.interop.colmap import model as colmap
 from maplab_py.vimap.table import starts_of_counts
 
 _MAX_BYTES = 20_000_000_000
@@ -93,7 +83,7 @@ class _Cursor:
         return MapError(f"{self.path}: is damaged: {reason}; {REMEDY}")
 
 
-def read_binary(folder: Path) -> ColmapModel:
+def read_binary(folder: Path) -> colmap.ColmapModel:
     """Read the binary files of a model; references between the files are checked by the caller.
 
     Models of versions without rigs and frames get a rig of each camera, and a frame of each image.
@@ -107,16 +97,18 @@ def read_binary(folder: Path) -> ColmapModel:
     if (folder / "rigs.bin").exists() or (folder / "frames.bin").exists():
         rigs = _rigs(_Cursor(folder / "rigs.bin"))
         frames = _frames(_Cursor(folder / "frames.bin"))
-        return ColmapModel(cameras, rigs, frames, images, points)
+        return colmap.ColmapModel(cameras, rigs, frames, images, points)
     used = np.unique(images.camera).tolist()
     identity = np.array([[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]])
-    rigs = tuple(ColmapRig(number, ((SensorType.CAMERA, number),), identity) for number in used)
+    rigs = tuple(
+        colmap.ColmapRig(number, ((colmap.SensorType.CAMERA, number),), identity) for number in used
+    )
     rows = np.arange(len(images.id))
-    frames = ColmapFrames(images.id, images.camera, images.T_C_W, rows, images.id)
-    return ColmapModel(cameras, rigs, frames, images, points)
+    frames = colmap.ColmapFrames(images.id, images.camera, images.T_C_W, rows, images.id)
+    return colmap.ColmapModel(cameras, rigs, frames, images, points)
 
 
-def read_binary_cameras(path: Path) -> tuple[ColmapCamera, ...]:
+def read_binary_cameras(path: Path) -> tuple[colmap.ColmapCamera, ...]:
     """Read cameras.bin.
 
     Raises:
@@ -125,25 +117,25 @@ def read_binary_cameras(path: Path) -> tuple[ColmapCamera, ...]:
     return _cameras(_Cursor(path))
 
 
-def _cameras(file: _Cursor) -> tuple[ColmapCamera, ...]:
+def _cameras(file: _Cursor) -> tuple[colmap.ColmapCamera, ...]:
     cameras = []
     for _ in range(file.count(24)):
         number, model, width, height = file.numbers("IiQQ")
-        if model not in MODELS:
+        if model not in colmap.MODELS:
             raise file.damaged(f"camera {number} has the unknown camera model {model}")
-        parameters = file.doubles(MODELS[model].parameters)
+        parameters = file.doubles(colmap.MODELS[model].parameters)
         if not (0 < width < 1 << 31 and 0 < height < 1 << 31):
             raise file.damaged(f"the images of camera {number} have no pixels")
-        cameras.append(ColmapCamera(number, model, width, height, parameters))
+        cameras.append(colmap.ColmapCamera(number, model, width, height, parameters))
     file.finish()
     return tuple(cameras)
 
 
-def _rigs(file: _Cursor) -> tuple[ColmapRig, ...]:
+def _rigs(file: _Cursor) -> tuple[colmap.ColmapRig, ...]:
     rigs = []
     for _ in range(file.count(8)):
         number, count = file.numbers("II")
-        sensors: list[Sensor] = []
+        sensors: list[colmap.Sensor] = []
         poses: list[F64] = []
         for row in range(count):
             kind, sensor = file.numbers("iI")
@@ -152,12 +144,12 @@ def _rigs(file: _Cursor) -> tuple[ColmapRig, ...]:
                 pose = file.pose() if file.take(1) != b"\0" else np.full(7, np.nan)
             sensors.append((kind, sensor))
             poses.append(pose)
-        rigs.append(ColmapRig(number, tuple(sensors), np.array(poses).reshape(-1, 7)))
+        rigs.append(colmap.ColmapRig(number, tuple(sensors), np.array(poses).reshape(-1, 7)))
     file.finish()
     return tuple(rigs)
 
 
-def _frames(file: _Cursor) -> ColmapFrames:
+def _frames(file: _Cursor) -> colmap.ColmapFrames:
     count = file.count(68)
     ids, rigs, poses = [], [], []
     owners: list[int] = []
@@ -169,16 +161,16 @@ def _frames(file: _Cursor) -> ColmapFrames:
         poses.append(file.pose())
         for _ in range(file.numbers("I")[0]):
             kind, _, data = file.numbers("iIQ")
-            if kind == SensorType.CAMERA:
+            if kind == colmap.SensorType.CAMERA:
                 owners.append(row)
                 images.append(data)
     file.finish()
-    return ColmapFrames(
+    return colmap.ColmapFrames(
         _integers(ids), _integers(rigs), _rows(poses, 7), _integers(owners), _integers(images)
     )
 
 
-def _images(file: _Cursor) -> ColmapImages:
+def _images(file: _Cursor) -> colmap.ColmapImages:
     ids, cameras, poses, names, counts = [], [], [], [], []
     keypoints = [np.zeros(0, dtype=KEYPOINT)]
     for _ in range(file.count(69)):
@@ -193,7 +185,7 @@ def _images(file: _Cursor) -> ColmapImages:
     table = np.concatenate(keypoints)
     if not np.all(np.isfinite(table["uv"])):
         raise file.damaged("it has keypoints that are not finite")
-    return ColmapImages(
+    return colmap.ColmapImages(
         _integers(ids),
         _integers(cameras),
         _rows(poses, 7),
@@ -204,7 +196,7 @@ def _images(file: _Cursor) -> ColmapImages:
     )
 
 
-def _points(file: _Cursor) -> ColmapPoints:
+def _points(file: _Cursor) -> colmap.ColmapPoints:
     count = file.count(POINT.itemsize)
     data = np.frombuffer(file.data, dtype=np.uint8)
     starts = record_starts(data, file.place, count)
@@ -216,7 +208,7 @@ def _points(file: _Cursor) -> ColmapPoints:
     p_W = np.ascontiguousarray(records["p_W"], dtype=np.float64)
     if not np.all(np.isfinite(p_W)):
         raise file.damaged("it has points that are not finite")
-    return ColmapPoints(
+    return colmap.ColmapPoints(
         records["id"].astype(np.int64),
         p_W,
         records["colour"].copy(),
@@ -240,7 +232,7 @@ ELEMENT = np.dtype([("image", "<u4"), ("keypoint", "<u4")])
 _TO_FILE = [3, 0, 1, 2, 4, 5, 6]  # the quaternion's w comes first
 
 
-def binary_files(model: ColmapModel) -> dict[str, Iterator[bytes]]:
+def binary_files(model: colmap.ColmapModel) -> dict[str, Iterator[bytes]]:
     """Return the content of the files of a model by name."""
     return {
         "cameras.bin": _encode_cameras(model),
@@ -251,14 +243,14 @@ def binary_files(model: ColmapModel) -> dict[str, Iterator[bytes]]:
     }
 
 
-def _encode_cameras(model: ColmapModel) -> Iterator[bytes]:
+def _encode_cameras(model: colmap.ColmapModel) -> Iterator[bytes]:
     yield struct.pack("<Q", len(model.cameras))
     for camera in model.cameras:
         yield struct.pack("<IiQQ", camera.id, camera.model, camera.width_px, camera.height_px)
         yield _doubles(camera.parameters)
 
 
-def _encode_rigs(model: ColmapModel) -> Iterator[bytes]:
+def _encode_rigs(model: colmap.ColmapModel) -> Iterator[bytes]:
     yield struct.pack("<Q", len(model.rigs))
     for rig in model.rigs:
         yield struct.pack("<II", rig.id, len(rig.sensors))
@@ -268,7 +260,7 @@ def _encode_rigs(model: ColmapModel) -> Iterator[bytes]:
                 yield b"\x01" + _doubles(rig.T_S_R[row, _TO_FILE])
 
 
-def _encode_frames(model: ColmapModel) -> Iterator[bytes]:
+def _encode_frames(model: colmap.ColmapModel) -> Iterator[bytes]:
     frames = model.frames
     order = np.argsort(frames.image_frame, kind="stable")
     images = frames.image_id[order]
@@ -281,10 +273,10 @@ def _encode_frames(model: ColmapModel) -> Iterator[bytes]:
         yield struct.pack("<I", len(mine))
         for image in mine:
             camera = int(model.images.camera[row_of_image[image]])
-            yield struct.pack("<iIQ", SensorType.CAMERA, camera, image)
+            yield struct.pack("<iIQ", colmap.SensorType.CAMERA, camera, image)
 
 
-def _encode_images(model: ColmapModel) -> Iterator[bytes]:
+def _encode_images(model: colmap.ColmapModel) -> Iterator[bytes]:
     images = model.images
     keypoints = np.zeros(len(images.uv), dtype=KEYPOINT)
     keypoints["uv"], keypoints["point"] = images.uv, images.point
@@ -297,7 +289,7 @@ def _encode_images(model: ColmapModel) -> Iterator[bytes]:
         yield keypoints[start[row] : start[row + 1]].tobytes()
 
 
-def _encode_points(model: ColmapModel) -> Iterator[bytes]:
+def _encode_points(model: colmap.ColmapModel) -> Iterator[bytes]:
     """Yield the records as bytes that are scattered to their places."""
     points, images = model.points, model.images
     observing = np.flatnonzero(images.point >= 0)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import re
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from maplab_py.geometry import se3
 from maplab_py.interop.colmap import binary, child, child_process, undistortion
 from maplab_py.interop.colmap import model as colmap
 from maplab_py.interop.colmap.options import ColmapExportOptions, ColmapExportReport
-from maplab_py.output_files import check_writable, write_bytes
+from maplab_py.output_files import check_writable, copy_file, write_bytes
 from maplab_py.sensors import Camera, projection
 from maplab_py.vimap import LandmarkQuality, MissionSensor, VIMap, edits, from_hex, is_valid
 from maplab_py.vimap.descriptors import (
@@ -32,7 +31,6 @@ from maplab_py.vimap.queries import is_metric, mission_labels, mission_sensor_id
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
 
 DATABASE = "database.db"
-_CHUNK_BYTES = 1 << 24
 
 
 def export_colmap(
@@ -68,7 +66,7 @@ def export_colmap(
             child_process.run_job("write_text", work, folder)
             for kind in colmap.FILES:
                 path = folder / f"{kind}.txt"
-                write_bytes(path, _chunks(work / child.TEXT / path.name), overwrite=overwrite)
+                copy_file(work / child.TEXT / path.name, path, overwrite=overwrite)
         else:
             for file, content in binary.binary_files(model).items():
                 write_bytes(folder / file, content, overwrite=overwrite)
@@ -145,13 +143,7 @@ def _write_database(
         arrays["priors"] = np.ones(1)
     np.savez(work / "database.npz", **arrays)
     child_process.run_job("database", work, folder / DATABASE)
-    write_bytes(folder / DATABASE, _chunks(work / DATABASE), overwrite=overwrite)
-
-
-def _chunks(path: Path) -> Iterator[bytes]:
-    with path.open("rb") as stream:
-        while chunk := stream.read(_CHUNK_BYTES):
-            yield chunk
+    copy_file(work / DATABASE, folder / DATABASE, overwrite=overwrite)
 
 
 _MAX_GAP = 50
@@ -247,7 +239,6 @@ class ExportedModel:
     side_file: colmap.SideFile
     frames: I64  # (N,) rows of the images
     keypoints: I64  # (K,) rows
-    landmarks: I64  # (L,) rows
     observations: int
     mean_error_px: float  # of observations in front of their cameras
 
@@ -310,7 +301,7 @@ def model_of_map(
     )
     side_file = _side_file(vi_map, rigs, frames, vertex, images)
     observations = int(np.count_nonzero(point != colmap.NO_POINT))
-    return ExportedModel(model, side_file, frames, keypoints, landmarks, observations, mean_error)
+    return ExportedModel(model, side_file, frames, keypoints, observations, mean_error)
 
 
 def map_rigs(vi_map: VIMap, missions: I64) -> list[MapRig]:

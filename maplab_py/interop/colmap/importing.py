@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import re
-import tempfile
 from collections.abc import Sequence
 from decimal import Decimal
 from pathlib import Path, PurePosixPath
@@ -16,8 +15,8 @@ from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import interpolation, se3, so3
 from maplab_py.geometry.alignment import apply_similarity, umeyama
 from maplab_py.input_files import read_foreign_text
-from maplab_py.interop.colmap import child_process, features, reading, to_map, undistortion
-from maplab_py.interop.colmap.model import MODELS, ColmapModel, SensorType, SideFile, has_model
+from maplab_py.interop.colmap import features, reading, to_map, undistortion
+from maplab_py.interop.colmap.model import ColmapModel, SideFile, has_model
 from maplab_py.interop.colmap.options import ColmapImportOptions, ColmapImportReport
 from maplab_py.interop.stamps import IMAGES, parse_stamps
 from maplab_py.interop.trajectories import Trajectory, read_trajectory
@@ -52,7 +51,7 @@ def import_colmap(
                 "--undistort changes the cameras, and --images are as recorded: let COLMAP undistort the "
                 "images (image_undistorter) and import its model"
             )
-        model = _perspective(model, folder)
+        model = undistortion.perspective_model(model, folder)
     side = SideFile.read(folder)
     times_ns = _times(model, side, options)
     bodies = to_map.body_frames(model, times_ns, side)
@@ -105,23 +104,23 @@ def _times(model: ColmapModel, side: SideFile | None, options: ColmapImportOptio
     if side is not None:
         times_ns[known >= 0] = side.image_time_ns[known[known >= 0]]
     new = np.flatnonzero(known < 0)
-    file = Path(options.timestamps_file) if options.timestamps_file else None
-    names = tuple(model.images.name[row] for row in new.tolist())
-    times_ns[new] = image_times(
-        names,
-        options.timestamps_from,
-        file,
-        interval_s=options.order_interval_s,
-        time_unit=options.time_unit,
-    )
+    times_ns[new] = image_times(tuple(model.images.name[row] for row in new.tolist()), options)
     return times_ns
 
 
 def _place(model: ColmapModel, bodies: to_map.BodyFrames, options: ColmapImportOptions) -> Placing:
     if options.align_to:
         trajectory = read_trajectory(Path(options.align_to))
-        return place_by_trajectory(bodies.time_ns, bodies.T_W_R, bodies.T_R_I, trajectory)
-    return place_by_flags(se3.inverse(model.images.T_C_W), options.scale, options.gravity)
+        return _place_by_trajectory(bodies, trajectory)
+    if not np.isfinite(options.scale) or options.scale < 0.0:
+        raise UserError(
+            f"--scale={options.scale:g}: wants metres per unit of the model, or 0 = unknown"
+        )
+    T_G_W = se3.identity()
+    if options.gravity:
+        direction = _direction(se3.inverse(model.images.T_C_W), options.gravity)
+        T_G_W = se3.make(_turn_to_down(direction), np.zeros(3))
+    return Placing(T_G_W, options.scale or 1.0, bool(options.scale and options.gravity))
 
 
 def _metric_missions(
@@ -133,21 +132,6 @@ def _metric_missions(
         rows = bodies.mission_row
         metric |= (rows >= 0) & (side.is_metric[rows] != 0)
     return metric
-
-
-def _perspective(model: ColmapModel, folder: Path) -> ColmapModel:
-    """Return the model with perspective cameras where maplab has no model of a camera."""
-    for camera in model.cameras:
-        if MODELS[camera.model].name == "EQUIRECTANGULAR":
-            raise UserError(
-                f"{folder}: camera {camera.id} is EQUIRECTANGULAR: no perspective image shows it"
-            )
-    with tempfile.TemporaryDirectory(prefix="maplab-colmap-") as name:
-        work = Path(name)
-        child_process.write_job_model(model, work)
-        return undistortion.perspective_model(
-            model, work, lambda: child_process.run_job("undistort", work, folder)
-        )
 
 
 def _notes(vi_map: VIMap, side: SideFile | None) -> tuple[str, ...]:
@@ -169,41 +153,31 @@ _FEWEST_DIGITS = 9
 """Shorter whole numbers in names count images."""
 
 
-def image_times(
-    names: tuple[str, ...],
-    source: str,
-    file: Path | None,
-    *,
-    interval_s: float,
-    time_unit: str = "",
-) -> I64:
-    """Return the times (N,) [ns] of images.
+def image_times(names: tuple[str, ...], options: ColmapImportOptions) -> I64:
+    """Return the times (N,) [ns] of images by their names.
 
-    Args:
-        names: Names of the images.
-        source: name = the last number in the file's name; file = lines of name and time stamp; order =
-            images in the order of their names without folders, which equal frames share.
-        interval_s: Time between images by order [s].
-        time_unit: Unit of the stamps; empty = see `stamps`.
+    By name it is the last number in the file's name; by order images follow their names without folders,
+    which equal frames share.
 
     Raises:
         UserError: A name has no time stamp, or the file is not given or lacks an image.
         MapError: The file is damaged.
     """
-    if source == "order":
+    if options.timestamps_from == "order":
         stems = np.array([PurePosixPath(name).name for name in names])
         _, row = np.unique(stems, return_inverse=True)
-        return np.asarray((row + 1) * round(interval_s * _NS_PER_S), dtype=np.int64)
-    if source == "file":
-        if file is None:
+        return np.asarray((row + 1) * round(options.order_interval_s * _NS_PER_S), dtype=np.int64)
+    if options.timestamps_from == "file":
+        if not options.timestamps_file:
             raise UserError("--timestamps_from=file needs the file: give --timestamps_file=FILE")
-        times = read_times(file, time_unit)
+        file = Path(options.timestamps_file)
+        times = read_times(file, options.time_unit)
         missing = [name for name in names if name not in times]
         if missing:
             raise UserError(f"{file}: has no time stamp of image {missing[0]}: add a line for it")
         return np.array([times[name] for name in names], dtype=np.int64)
     tokens = [_stamp_of_name(name) for name in names]
-    return _times_ns(names, tokens, "names of images", None, time_unit)
+    return _times_ns(names, tokens, "names of images", None, options.time_unit)
 
 
 def read_times(file: Path, time_unit: str = "") -> dict[str, int]:
@@ -299,8 +273,7 @@ def with_poses(model: ColmapModel, choice: str = "") -> tuple[ColmapModel, str]:
     of_camera = {
         number: (row, pose)
         for rig in model.rigs
-        for row, ((kind, number), pose) in enumerate(zip(rig.sensors, rig.T_S_R, strict=True))
-        if kind == SensorType.CAMERA
+        for row, (number, pose) in enumerate(zip(rig.cameras, rig.T_C_R, strict=True))
     }
     sensor = np.array([of_camera[camera][0] for camera in images.camera.tolist()], dtype=np.int64)
     T_S_R = np.array([of_camera[camera][1] for camera in images.camera.tolist()]).reshape(-1, 7)
@@ -331,28 +304,18 @@ def with_poses(model: ColmapModel, choice: str = "") -> tuple[ColmapModel, str]:
     return dataclasses.replace(model, frames=dataclasses.replace(frames, T_R_W=poses)), said
 
 
-def place_by_trajectory(times_ns: I64, T_W_R: F64, T_R_I: F64, trajectory: Trajectory) -> Placing:
-    """Align body positions with a trajectory, interpolated at their times, by a similarity.
-
-    Args:
-        times_ns: Times (N,).
-        T_W_R: Poses (N, 7) of the rig, in units of the model.
-        T_R_I: Poses (N, 7) of the body on the rig, in metres.
-        trajectory: Poses of the body.
-
-    Raises:
-        UserError: Fewer than three vertices have a pose in the trajectory.
-    """
+def _place_by_trajectory(bodies: to_map.BodyFrames, trajectory: Trajectory) -> Placing:
+    """Align body positions with a trajectory, interpolated at their times, by a similarity."""
     stamps, first = np.unique(trajectory.times_ns, return_index=True)
     T_G_I, valid = interpolation.interpolate_poses(
-        stamps, trajectory.T_R_B[first], times_ns, max_gap_ns=_LONGEST_GAP_NS
+        stamps, trajectory.T_R_B[first], bodies.time_ns, max_gap_ns=_LONGEST_GAP_NS
     )
     if np.count_nonzero(valid) < _MIN_MATCHED:
         raise UserError(
             f"--align_to={trajectory.source}: {np.count_nonzero(valid)} frames lie in its time span, at "
             f"least {_MIN_MATCHED} are needed: check --timestamps_from, and the clock of its stamps"
         )
-    p_G, T_W_R, p_R_I = T_G_I[valid, 4:], T_W_R[valid], T_R_I[valid, 4:]
+    p_G, T_W_R, p_R_I = T_G_I[valid, 4:], bodies.T_W_R[valid], bodies.T_R_I[valid, 4:]
     T_G_W, scale = umeyama(p_G, T_W_R[:, 4:], with_scale=True)
     rounds = _LEVER_ROUNDS if np.any(p_R_I) else 0
     for _ in range(rounds):  # the body's lever arm is not scaled
@@ -363,26 +326,8 @@ def place_by_trajectory(times_ns: I64, T_W_R: F64, T_R_I: F64, trajectory: Traje
     return Placing(T_G_W, scale, True, int(np.count_nonzero(valid)), rmse)
 
 
-def place_by_flags(T_W_C: F64, scale: float, gravity: str) -> Placing:
-    """Scale the model, and turn its direction of gravity to -z.
-
-    Args:
-        T_W_C: Poses (N, 7) of the cameras.
-        scale: Metres per unit of the model; 0 = unknown.
-        gravity: Direction "x,y,z" in W, `UPRIGHT` = mean of the images' downward axes, empty = unknown.
-
-    Raises:
-        UserError: A value is wrong.
-    """
-    if not np.isfinite(scale) or scale < 0.0:
-        raise UserError(f"--scale={scale:g}: wants metres per unit of the model, or 0 = unknown")
-    T_G_W = se3.identity()
-    if gravity:
-        T_G_W = se3.make(_turn_to_down(_direction(T_W_C, gravity)), np.zeros(3))
-    return Placing(T_G_W, scale or 1.0, bool(scale and gravity))
-
-
 def _direction(T_W_C: F64, gravity: str) -> F64:
+    """Return the unit vector of "x,y,z" in W, or for `UPRIGHT` the mean of the images' downward axes."""
     if gravity == UPRIGHT:
         down = so3.rotate(T_W_C[:, :4], np.array([0.0, 1.0, 0.0])).mean(axis=0)
     else:
@@ -401,11 +346,6 @@ def _direction(T_W_C: F64, gravity: str) -> F64:
 def _turn_to_down(direction: F64) -> F64:
     """Return the smallest rotation (4,) that takes a unit vector to -z."""
     down = np.array([0.0, 0.0, -1.0])
-    axis = np.cross(direction, down)
-    sine, cosine = float(np.linalg.norm(axis)), float(direction @ down)
-    if sine < 1e-12:
-        axis, sine = np.array([1.0, 0.0, 0.0]), 1.0
-        angle = 0.0 if cosine > 0.0 else np.pi
-    else:
-        angle = float(np.arctan2(sine, cosine))
-    return np.asarray(so3.exp(axis / sine * angle))
+    q = np.append(np.cross(direction, down), 1.0 + direction @ down)
+    is_opposite = float(np.linalg.norm(q)) < 1e-12
+    return np.array([1.0, 0.0, 0.0, 0.0]) if is_opposite else so3.normalize(q)

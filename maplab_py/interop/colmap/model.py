@@ -58,6 +58,16 @@ class ColmapRig:
     sensors: tuple[Sensor, ...]
     T_S_R: F64  # (n, 7); NaN where the file has none
 
+    @property
+    def cameras(self) -> list[int]:
+        """Ids of the cameras among the sensors."""
+        return [number for kind, number in self.sensors if kind == SensorType.CAMERA]
+
+    @property
+    def T_C_R(self) -> F64:
+        """Poses of the cameras."""
+        return self.T_S_R[[kind == SensorType.CAMERA for kind, _ in self.sensors]]
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ColmapFrames:
@@ -112,6 +122,16 @@ class ColmapModel:
     frames: ColmapFrames
     images: ColmapImages
     points: ColmapPoints
+
+    @property
+    def camera_ids(self) -> I64:
+        """Ids (C,) of the cameras."""
+        return np.array([camera.id for camera in self.cameras], dtype=np.int64)
+
+    @property
+    def rig_ids(self) -> I64:
+        """Ids (R,) of the rigs."""
+        return np.array([rig.id for rig in self.rigs], dtype=np.int64)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -197,22 +217,16 @@ def map_camera(camera: ColmapCamera, sensor_id: str) -> Camera:
             f"camera {camera.id}: maplab has no camera model {model.name}: give --undistort to import "
             "perspective keypoints"
         )
-    focal, rest = (values[[0, 0]], values[1:]) if model.has_single_focal_length else _split(values)
+    focals = 1 if model.has_single_focal_length else 2
+    focal, rest = values[[0, focals - 1]], values[focals:]
     pinhole = np.concatenate([focal, rest[:2] - PIXEL_CENTRE])
     projection, coefficients = Projection.PINHOLE, np.zeros(DISTORTION_SIZE[distortion])
     if model.number == _EUCM:
         projection, pinhole = Projection.EXTENDED_UNIFIED, np.concatenate([rest[2:], pinhole])
     else:
         coefficients[: len(rest) - 2] = rest[2:]
-    return Camera(
-        sensor_id,
-        projection,
-        distortion,
-        pinhole,
-        coefficients,
-        camera.width_px,
-        camera.height_px,
-    )
+    size = camera.width_px, camera.height_px
+    return Camera(sensor_id, projection, distortion, pinhole, coefficients, *size)
 
 
 def has_model(camera: ColmapCamera) -> bool:
@@ -225,10 +239,6 @@ def _smallest_model(coefficients: F64) -> Distortion:
     if coefficients[5:].any():
         return Distortion.RATIONAL
     return Distortion.RADTAN5 if coefficients[4] else Distortion.RADTAN
-
-
-def _split(values: F64) -> tuple[F64, F64]:
-    return values[:2], values[2:]
 
 
 # What a COLMAP model cannot hold of a map: ids, times, body frames and qualities, in a file beside it.

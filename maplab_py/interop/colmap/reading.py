@@ -192,17 +192,8 @@ def check_model(model: colmap.ColmapModel, source: Path) -> None:
     images, frames, points = model.images, model.frames, model.points
     if not len(images.id):
         raise MapError(f"{source}: the model has no images with a pose: nothing can be imported")
-    cameras = np.array([camera.id for camera in model.cameras], dtype=np.int64)
-    rigs = np.array([rig.id for rig in model.rigs], dtype=np.int64)
-    sensors = np.array(
-        [
-            number
-            for rig in model.rigs
-            for kind, number in rig.sensors
-            if kind == colmap.SensorType.CAMERA
-        ],
-        dtype=np.int64,
-    )
+    cameras, rigs = model.camera_ids, model.rig_ids
+    sensors = np.array([c for rig in model.rigs for c in rig.cameras], dtype=np.int64)
     for noun, ids in (
         ("camera", cameras),
         ("rig", rigs),
@@ -281,11 +272,9 @@ def _rig(model: colmap.ColmapModel, folder: Path) -> tuple[tuple[colmap.ColmapCa
         )
     rig = model.rigs[0]
     by_id = {camera.id: camera for camera in model.cameras}
-    mine = [row for row, sensor in enumerate(rig.sensors) if sensor[0] == colmap.SensorType.CAMERA]
-    T_S_R = rig.T_S_R[mine]
-    if not np.isfinite(T_S_R).all():
+    if not np.isfinite(rig.T_C_R).all():
         raise UserError(f"{folder}: rig {rig.id} has a camera without pose: reconstruct it first")
-    return tuple(by_id[rig.sensors[row][1]] for row in mine), se3.inverse(T_S_R)
+    return tuple(by_id[number] for number in rig.cameras), se3.inverse(rig.T_C_R)
 
 
 def _text_cameras(path: Path) -> tuple[colmap.ColmapCamera, ...]:

@@ -12,7 +12,6 @@ from maplab_py.interop.colmap.model import (
     PIXEL_CENTRE,
     ColmapModel,
     ColmapRig,
-    SensorType,
     SideFile,
     map_camera,
 )
@@ -67,7 +66,7 @@ def body_frames(model: ColmapModel, times_ns: I64, side: SideFile | None) -> Bod
     frame, first = np.unique(owner, return_index=True)
     time_ns = np.minimum.reduceat(times_ns[image], first)
     side_vertex = np.full(len(frame), -1, dtype=np.int64)
-    rig = _rows_of(np.array([r.id for r in model.rigs]), model.frames.rig[frame])
+    rig = _rows_of(model.rig_ids, model.frames.rig[frame])
     T_I_R = se3.identity(len(model.rigs))
     side_mission = np.full(len(frame), -1, dtype=np.int64)
     if side is not None:
@@ -76,7 +75,7 @@ def body_frames(model: ColmapModel, times_ns: I64, side: SideFile | None) -> Bod
         is_known = side_vertex >= 0
         time_ns = np.where(is_known, side.vertex_time_ns[side_vertex], time_ns)
         side_mission = np.where(is_known, side.vertex_mission[side_vertex], -1)
-        rows = _rows_of(side.rig, np.array([r.id for r in model.rigs]))
+        rows = _rows_of(side.rig, model.rig_ids)
         T_I_R[rows >= 0] = side.T_I_R[rows[rows >= 0]]
     groups, mission = np.unique(
         np.stack([side_mission < 0, side_mission, rig], axis=1), axis=0, return_inverse=True
@@ -188,10 +187,8 @@ def _sensors(
     camera_id = random_ids(len(model.cameras), rng)
     rig_id = random_ids(len(model.rigs), rng)
     if side is not None:
-        rows = _rows_of(side.camera, np.array([camera.id for camera in model.cameras]))
-        camera_id = _restored(camera_id, rows, side.camera_id)
-        rows = _rows_of(side.rig, np.array([rig.id for rig in model.rigs]))
-        rig_id = _restored(rig_id, rows, side.rig_id)
+        camera_id = _restored(camera_id, _rows_of(side.camera, model.camera_ids), side.camera_id)
+        rig_id = _restored(rig_id, _rows_of(side.rig, model.rig_ids), side.rig_id)
     sensors: dict[str, CameraRig | sensor_set.OtherSensor] = {}
     extrinsics: dict[str, sensor_set.Extrinsics] = {}
     sensor_id = np.zeros((len(bodies.mission_rig), len(MissionSensor), 2), dtype=np.uint64)
@@ -199,10 +196,9 @@ def _sensors(
     for mission, row in enumerate(bodies.mission_rig.tolist()):
         rig, name = model.rigs[row], to_hex(rig_id[row])
         T_C_R = camera_poses(rig, scale)
-        numbers = [number for kind, number in rig.sensors if kind == SensorType.CAMERA]
         cameras = tuple(
-            map_camera(model.cameras[camera_rows[number]], to_hex(camera_id[camera_rows[number]]))
-            for number in numbers
+            map_camera(model.cameras[place], to_hex(camera_id[place]))
+            for place in (camera_rows[number] for number in rig.cameras)
         )
         T_I_C = se3.compose(bodies.T_I_R[row], se3.inverse(T_C_R))
         sensors[name] = CameraRig(name, cameras, T_I_C)
@@ -223,8 +219,7 @@ def camera_poses(rig: ColmapRig, scale: float) -> F64:
     Raises:
         MapError: A camera has no pose.
     """
-    is_camera = np.array([kind == SensorType.CAMERA for kind, _ in rig.sensors], dtype=np.bool_)
-    T_C_R = rig.T_S_R[is_camera].copy()
+    T_C_R = rig.T_C_R
     if not np.all(np.isfinite(T_C_R)):
         raise MapError(
             f"rig {rig.id}: a camera has no pose on the rig: let COLMAP estimate it (rig_configurator)"
@@ -247,11 +242,7 @@ def _frames(
     vertex = vertex_of[model.frames.image_frame]
     kept = (image >= 0) & (vertex >= 0)
     image, vertex = image[kept], vertex[kept]
-    index_of = {
-        number: index
-        for rig in model.rigs
-        for index, number in enumerate(n for kind, n in rig.sensors if kind == SensorType.CAMERA)
-    }
+    index_of = {number: k for rig in model.rigs for k, number in enumerate(rig.cameras)}
     index = np.array([index_of[camera] for camera in model.images.camera[image].tolist()])
     order = np.lexsort((index, vertex))
     image, vertex, index = image[order], vertex[order], index[order]

@@ -1,13 +1,15 @@
 """Perspective cameras and undistorted keypoints, of models to import and of maps to export."""
 
 import dataclasses
-from collections.abc import Callable
+import tempfile
 from pathlib import Path
 
 import numpy as np
 
 from maplab_py.array_types import I64
-from maplab_py.interop.colmap.model import NO_POINT, ColmapCamera, ColmapModel, has_model
+from maplab_py.errors import UserError
+from maplab_py.interop.colmap import child_process
+from maplab_py.interop.colmap.model import MODELS, NO_POINT, ColmapCamera, ColmapModel, has_model
 from maplab_py.sensors import Camera, CameraRig, SensorSet, projection
 from maplab_py.sensors.camera import Distortion, Projection
 from maplab_py.vimap import MissionSensor, VIMap, mission_sensor_id, ragged_rows, starts_of_counts
@@ -17,15 +19,20 @@ _LARGEST_TANGENT = 10.0
 """Keypoints further from the axis than 84 degrees are not observations any more."""
 
 
-def perspective_model(model: ColmapModel, work: Path, undistort: Callable[[], None]) -> ColmapModel:
-    """Return the model with PINHOLE cameras and undistorted keypoints where maplab lacks a model.
+def perspective_model(model: ColmapModel, folder: Path) -> ColmapModel:
+    """Return the model of a folder with PINHOLE cameras and undistorted keypoints where maplab lacks a model.
 
-    Args:
-        work: Folder of the job `undistort`, which runs on `pixels.npz` there.
-        undistort: Runs the job.
+    Raises:
+        UserError: A camera is equirectangular.
+        MapError: pycolmap fails.
     """
     images = model.images
     cameras = [camera for camera in model.cameras if not has_model(camera)]
+    for camera in cameras:
+        if MODELS[camera.model].name == "EQUIRECTANGULAR":
+            raise UserError(
+                f"{folder}: camera {camera.id} is EQUIRECTANGULAR: no perspective image shows it"
+            )
     rows = [
         ragged_rows(images.keypoint_start, np.flatnonzero(images.camera == camera.id))
         for camera in cameras
@@ -33,10 +40,13 @@ def perspective_model(model: ColmapModel, work: Path, undistort: Callable[[], No
     start = starts_of_counts(np.array([len(part) for part in rows]))
     chosen = np.concatenate(rows)
     numbers = np.array([camera.id for camera in cameras])
-    np.savez(work / "pixels.npz", uv=images.uv[chosen], start=start, cameras=numbers)
-    undistort()
-    with np.load(work / "undistorted.npz", allow_pickle=False) as result:
-        rays = result["rays"]
+    with tempfile.TemporaryDirectory(prefix="maplab-colmap-") as name:
+        work = Path(name)
+        child_process.write_job_model(model, work)
+        np.savez(work / "pixels.npz", uv=images.uv[chosen], start=start, cameras=numbers)
+        child_process.run_job("undistort", work, folder)
+        with np.load(work / "undistorted.npz", allow_pickle=False) as result:
+            rays = result["rays"]
     new = {camera.id: _pinhole(camera) for camera in cameras}
     uv, point = images.uv.copy(), images.point.copy()
     seen = np.isfinite(rays).all(axis=1)

@@ -8,16 +8,9 @@ from functools import partial
 from pathlib import Path
 
 from maplab_py.errors import UserError
+from maplab_py.interop.live import transport as transports
 from maplab_py.interop.live.connection import open_transport
 from maplab_py.interop.live.options import NetworkOptions
-from maplab_py.interop.live.transport import (
-    LOOK_EVERY_S,
-    Topic,
-    Transport,
-    pause,
-    topic_of,
-    wait_for_topics,
-)
 from maplab_py.interop.recordings import bag_files, bag_writing
 from maplab_py.options import Options, option
 from maplab_py.progress import SILENT, Progress
@@ -39,7 +32,7 @@ class RecordingOptions(Options, prefix="record_"):
     @property
     def names(self) -> list[str]:
         """Topics to record; empty = all."""
-        return [topic_of(word) for word in self.topics.split(",") if word.strip()]
+        return [transports.topic_of(word) for word in self.topics.split(",") if word.strip()]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,7 +108,9 @@ def record_bag(
         )
 
 
-def _topics(transport: Transport, names: list[str], wait_s: float) -> list[Topic]:
+def _topics(
+    transport: transports.Transport, names: list[str], wait_s: float
+) -> list[transports.Topic]:
     """Return the topics to record: those named, or all of standard types.
 
     Raises:
@@ -123,7 +118,7 @@ def _topics(transport: Transport, names: list[str], wait_s: float) -> list[Topic
     """
     known = bag_files.message_types(is_ros_2=transport.is_ros_2).fielddefs
     if names:
-        topics = wait_for_topics(transport, names, wait_s)
+        topics = transports.wait_for_topics(transport, names, wait_s)
         for topic in topics:
             if topic.type not in known:
                 raise UserError(
@@ -135,9 +130,9 @@ def _topics(transport: Transport, names: list[str], wait_s: float) -> list[Topic
     while time.monotonic() < deadline_s:
         topics = [t for t in transport.topics().values() if t.type in known]
         if topics:
-            pause(1.0)  # the others of the same robot
+            transports.pause(1.0)  # the others of the same robot
             return [t for t in transport.topics().values() if t.type in known]
-        pause()
+        transports.pause()
     raise UserError(f"{transport.name}: nobody publishes anything ({wait_s:g} s waited)")
 
 
@@ -145,7 +140,11 @@ class _Arrivals:
     """Messages in the order of their arrival, on their way to the disk."""
 
     def __init__(
-        self, transport: Transport, topics: Sequence[Topic], silence_s: float, duration_s: float
+        self,
+        transport: transports.Transport,
+        topics: Sequence[transports.Topic],
+        silence_s: float,
+        duration_s: float,
     ) -> None:
         self.dropped, self.duration_s = 0, 0.0
         self._silence_s, self._longest_s = silence_s, duration_s
@@ -175,7 +174,7 @@ class _Arrivals:
         last_ns = 0
         while not is_to_end() and not 0.0 < self._longest_s <= time.monotonic() - begin_s:
             try:
-                message = self._queue.get(timeout=LOOK_EVERY_S)
+                message = self._queue.get(timeout=transports.LOOK_EVERY_S)
             except queue.Empty:
                 if 0.0 < self._silence_s < time.monotonic() - heard_s:
                     break

@@ -17,12 +17,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from rosbags.interfaces import (
-    Connection,
-    ConnectionExtRosbag2,
-    MessageDefinition,
-    MessageDefinitionFormat,
-)
+from rosbags import interfaces
 from rosbags.rosbag1 import Reader as Reader1
 from rosbags.rosbag2 import storage_mcap
 from rosbags.rosbag2.metadata import ReaderMetadata, parse_qos
@@ -42,11 +37,11 @@ else:
 
 _ZSTD_FRAME = b"\x28\xb5\x2f\xfd"
 _FORMATS = {
-    "ros2msg": MessageDefinitionFormat.MSG,
-    "ros2idl": MessageDefinitionFormat.IDL,
-    "omgidl": MessageDefinitionFormat.IDL,
+    "ros2msg": interfaces.MessageDefinitionFormat.MSG,
+    "ros2idl": interfaces.MessageDefinitionFormat.IDL,
+    "omgidl": interfaces.MessageDefinitionFormat.IDL,
 }
-_NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
+_NO_DEFINITION = interfaces.MessageDefinition(interfaces.MessageDefinitionFormat.NONE, "")
 _IDL_SEPARATOR = "=" * 80 + "\n"
 _LAST_NS = (1 << 63) - 1
 
@@ -71,10 +66,10 @@ class BagReader:
         self._path, self._files, self._metadata = path, files, metadata
         self._stack = contextlib.ExitStack()
         self._storages: list[Any] = []
-        self._sources: dict[int, list[tuple[Any, Connection]]] = {}
+        self._sources: dict[int, list[tuple[Any, interfaces.Connection]]] = {}
         self._stores: dict[str, Typestore] = {}
         self.is2 = path.is_dir() or storage_kind(path) != "ros1"
-        self.connections: list[Connection] = []
+        self.connections: list[interfaces.Connection] = []
 
     def __enter__(self) -> BagReader:
         """Open all files."""
@@ -106,10 +101,10 @@ class BagReader:
 
     def messages(
         self,
-        connections: Collection[Connection] = (),
+        connections: Collection[interfaces.Connection] = (),
         start: int | None = None,
         stop: int | None = None,
-    ) -> Iterator[tuple[Connection, int, bytes]]:
+    ) -> Iterator[tuple[interfaces.Connection, int, bytes]]:
         """Yield connection, arrival [ns] and data of messages from start to stop, in their order.
 
         Args:
@@ -117,7 +112,7 @@ class BagReader:
             start: Earliest arrival [ns].
             stop: Messages that arrive then or later are left out.
         """
-        parts: list[Iterator[tuple[Connection, int, bytes]]] = []
+        parts: list[Iterator[tuple[interfaces.Connection, int, bytes]]] = []
         for storage in self._storages:
             wanted = {
                 source.id: (source, connection)
@@ -146,7 +141,7 @@ class BagReader:
 
     def _open(self) -> None:
         if self.is2:
-            channels: dict[tuple[str, str], list[tuple[Any, Connection]]] = {}
+            channels: dict[tuple[str, str], list[tuple[Any, interfaces.Connection]]] = {}
             for file in self._files:
                 unpacked = self._unpacked(file)
                 is_mcap = storage_kind(unpacked) == "mcap"
@@ -172,7 +167,7 @@ class BagReader:
             for source in reader.connections:
                 self._add([(reader, source)], source.topic, source.msgtype)
 
-    def _add(self, sources: list[tuple[Any, Connection]], topic: str, kind: str) -> None:
+    def _add(self, sources: list[tuple[Any, interfaces.Connection]], topic: str, kind: str) -> None:
         number = len(self.connections)
         defined = [source for _, source in sources if source.msgdef.data] or [sources[0][1]]
         count = sum(source.msgcount for _, source in sources)
@@ -194,10 +189,10 @@ class BagReader:
     def _read(
         self,
         storage: Any,
-        wanted: dict[int, tuple[Connection, Connection]],
+        wanted: dict[int, tuple[interfaces.Connection, interfaces.Connection]],
         start: int | None,
         stop: int | None,
-    ) -> Iterator[tuple[Connection, int, bytes]]:
+    ) -> Iterator[tuple[interfaces.Connection, int, bytes]]:
         """Yield messages of one file; those that are compressed one by one are decompressed."""
         sources = [source for source, _ in wanted.values()]
         named = {key: connection for key, (_, connection) in wanted.items()}
@@ -254,10 +249,10 @@ def _digests(metadata: Mapping[str, Any]) -> dict[str, str]:
     return digests
 
 
-def _parsed(connection: Connection) -> Any:
+def _parsed(connection: interfaces.Connection) -> Any:
     """Return the types that the definition of a connection has."""
     text = connection.msgdef.data
-    if connection.msgdef.format == MessageDefinitionFormat.MSG:
+    if connection.msgdef.format == interfaces.MessageDefinitionFormat.MSG:
         return get_types_from_msg(text, connection.msgtype)
     if not text.startswith(f"{_IDL_SEPARATOR}IDL: "):
         return get_types_from_idl(text)
@@ -306,13 +301,13 @@ class _Database(Sqlite3Reader):
         columns = {row[1] for row in database.execute("PRAGMA table_info(topics)")}
         if not columns or not list(database.execute("PRAGMA table_info(messages)")):
             raise ValueError("the database has no tables of topics and messages")
-        definitions: dict[str, MessageDefinition] = {}
+        definitions: dict[str, interfaces.MessageDefinition] = {}
         if list(database.execute("PRAGMA table_info(message_definitions)")):
             for kind, encoding, text in database.execute(
                 "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
             ):
                 if encoding in _FORMATS:
-                    definitions[kind] = MessageDefinition(_FORMATS[encoding], text)
+                    definitions[kind] = interfaces.MessageDefinition(_FORMATS[encoding], text)
         counts = dict(database.execute("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id"))
         optional = [
             name if name in columns else "''"
@@ -325,10 +320,12 @@ class _Database(Sqlite3Reader):
             profiles: list[Any] = []
             with contextlib.suppress(Exception):
                 profiles = parse_qos(qos)
-            ext = ConnectionExtRosbag2(form, profiles)
+            ext = interfaces.ConnectionExtRosbag2(form, profiles)
             definition = definitions.get(kind, _NO_DEFINITION)
             self.connections.append(
-                Connection(key, topic, kind, definition, digest, counts.get(key, 0), ext, self)
+                interfaces.Connection(
+                    key, topic, kind, definition, digest, counts.get(key, 0), ext, self
+                )
             )
         ((first_ns, last_ns),) = database.execute(
             "SELECT MIN(timestamp), MAX(timestamp) FROM messages"

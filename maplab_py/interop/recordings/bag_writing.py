@@ -18,13 +18,12 @@ from maplab_py.cancellation import check_cancelled, cleaned_up
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.recordings.bag_files import all_messages, message_types
 from maplab_py.interop.recordings.bag_layouts import storage_kind
-from maplab_py.output_files import check_writable, write_bytes
+from maplab_py.output_files import check_writable, copy_file
 from maplab_py.progress import Progress
 
 if TYPE_CHECKING:
     from maplab_py.interop.recordings.bag_files import BagReader
 
-_CHUNK_BYTES = 1 << 20
 _METADATA = "metadata.yaml"
 _PROGRESS_EVERY = 200
 
@@ -194,7 +193,7 @@ def write_bag(
         scratch = Path(folder) / path.name
         counts = _written(scratch, kind, messages, path)
         for source, target in zip(bag_files(scratch, kind), bag_files(path, kind), strict=True):
-            write_bytes(target, _chunks(source), overwrite=overwrite)
+            copy_file(source, target, overwrite=overwrite)
     return counts
 
 
@@ -257,9 +256,3 @@ def _connection(writer: Any, channel: Channel, store: Any, kind: BagFormat, path
         rihs01=channel.digest or None,
         offered_qos_profiles=channel.qos,
     )
-
-
-def _chunks(path: Path) -> Iterator[bytes]:
-    with path.open("rb") as stream:
-        while chunk := stream.read(_CHUNK_BYTES):
-            yield chunk

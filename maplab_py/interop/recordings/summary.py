@@ -7,6 +7,7 @@ import numpy as np
 
 from maplab_py.array_types import I64
 from maplab_py.errors import MapError
+from maplab_py.geometry.interpolation import nearest_rows
 from maplab_py.interop.recordings import clocks, protocol
 from maplab_py.interop.recordings.options import StreamOptions
 from maplab_py.interop.recordings.stream import EventStream, StreamStatistics, Times
@@ -189,7 +190,8 @@ def _notes(
         )
     for row, times in enumerate(statistics.images):
         hole_ns, begin_ns = times.largest_hole_ns
-        if times.count > 2 and hole_ns > max(_HOLE_STEPS * _usual_step_ns(times), _HOLE_NS):
+        usual_ns = np.median(np.diff(times.all_ns)) if times.count > 2 else 0.0
+        if times.count > 2 and hole_ns > max(_HOLE_STEPS * usual_ns, _HOLE_NS):
             yield (
                 f"camera {row}: no images for {hole_ns * 1e-9:.2f} s from {(begin_ns - zero_ns) * 1e-9:.2f} s"
                 " on"
@@ -227,15 +229,7 @@ def _pair_notes(statistics: StreamStatistics, options: StreamOptions) -> Iterato
 
 def nearest_apart_ns(reference: I64, other: I64) -> I64:
     """Return how far each of some times (N,) is from the nearest of a reference (M,), M > 0, ascending."""
-    after = np.clip(np.searchsorted(reference, other), 1, max(len(reference) - 1, 1))
-    after = np.minimum(after, len(reference) - 1)
-    before = np.maximum(after - 1, 0)
-    apart_ns = np.minimum(np.abs(other - reference[after]), np.abs(other - reference[before]))
-    return np.asarray(apart_ns, dtype=np.int64)
-
-
-def _usual_step_ns(times: Times) -> float:
-    return float(np.median(np.diff(np.asarray(times.all_ns, dtype=np.int64))))
+    return np.asarray(np.abs(other - reference[nearest_rows(reference, other)]))
 
 
 def _imu_summary(statistics: StreamStatistics, start_ns: int) -> ImuSummary:

@@ -6,10 +6,17 @@ from pathlib import Path
 
 import numpy as np
 
-from maplab_py.array_types import I64, U8, NDArray
+from maplab_py.array_types import I64, NDArray
 from maplab_py.errors import MapError, UserError, os_errors_as
 from maplab_py.input_files import DEFAULT_MAX_BYTES, read_bytes
-from maplab_py.interop.ply import EmptyCloud, PlyCloud, encode_ply, parse_ply
+from maplab_py.interop.ply import (
+    INTENSITIES,
+    EmptyCloud,
+    PlyCloud,
+    cloud_of_table,
+    encode_ply,
+    parse_ply,
+)
 from maplab_py.interop.resources.matching import ImportedResources, stamped_files
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import counted
@@ -23,7 +30,7 @@ from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap, from_hex, queri
 _TYPES = {"F": "f", "I": "i", "U": "u"}
 _MAX_HEADER_BYTES = 100_000
 _MAX_POINTS = 100_000_000
-_SINGLE = ("x", "y", "z", "intensity", "rgb", "rgba")
+_SINGLE = ("x", "y", "z", *INTENSITIES, "rgb", "rgba", "red", "green", "blue", "r", "g", "b")
 """Fields of one value."""
 
 
@@ -58,14 +65,8 @@ def parse_pcd(data: bytes, source: str) -> PlyCloud:
                 table = _from_text(data[begin:], dtype, count)
     except (ValueError, FloatingPointError) as error:
         raise MapError(f"{source}: the PCD data end early or do not fit ({error})") from None
-    intensity = None
-    with np.errstate(invalid="ignore"):  # signalling NaN
-        p = np.stack([table[name].astype(np.float64) for name in ("x", "y", "z")], axis=1)
-        valid = np.isfinite(p).all(axis=1)
-        if "intensity" in (dtype.names or ()):
-            intensity = table["intensity"].astype(np.float64)[valid]
-    colours = _colours(table)
-    return PlyCloud(p[valid], None if colours is None else colours[valid], intensity)
+    cloud = cloud_of_table(table)
+    return cloud.where(np.isfinite(cloud.p).all(axis=1))
 
 
 def _header(data: bytes, source: str) -> tuple[dict[str, list[str]], int]:
@@ -114,17 +115,6 @@ def _from_text(body: bytes, dtype: np.dtype[np.void], count: int) -> NDArray[np.
         table[name] = column[:, 0] if dtype[name].shape == () else column.reshape(count, -1)
         first += width
     return table
-
-
-def _colours(table: NDArray[np.void]) -> U8 | None:
-    """Return the colours (N, 3) that PCL packs into the bytes of a number, None without any."""
-    names = table.dtype.names or ()
-    name = next((name for name in ("rgb", "rgba") if name in names), None)
-    if name is None or table.dtype[name].itemsize != 4:
-        return None
-    packed = np.ascontiguousarray(table[name]).view(np.uint32)
-    channels = [(packed >> shift) & 0xFF for shift in (16, 8, 0)]
-    return np.stack(channels, axis=1).astype(np.uint8)
 
 
 XYZ, XYZRGB, XYZI = 16, 17, 21
@@ -253,14 +243,7 @@ def read_cloud(path: Path) -> PlyCloud:
     if not valid.any():
         problem = "is not finite" if len(cloud.p) else "is empty"
         raise EmptyCloud(f"{path}: the cloud {problem}: remove the file, or export it again")
-    if valid.all():
-        return cloud
-    colours, intensity = cloud.colours, cloud.intensity
-    return PlyCloud(
-        cloud.p[valid],
-        None if colours is None else colours[valid],
-        None if intensity is None else intensity[valid],
-    )
+    return cloud if valid.all() else cloud.where(valid)
 
 
 def cloud_type(cloud: PlyCloud) -> int:

@@ -322,23 +322,21 @@ def test_types_that_are_not_there(tmp_path: Path) -> None:
     ],
 )
 def test_stamps_in_names(names: tuple[str, ...], times_ns: list[int]) -> None:
-    assert image_times(names, "name", None, interval_s=1.0).tolist() == times_ns
+    assert image_times(names, ColmapImportOptions()).tolist() == times_ns
 
 
 def test_the_unit_of_one_number_is_not_guessed() -> None:
     names = ("left_1403715273262143.png",)
     with pytest.raises(MapError, match="--time_unit"):
-        image_times(names, "name", None, interval_s=1.0)
-    assert image_times(names, "name", None, interval_s=1.0, time_unit="us").tolist() == [
-        1403715273262143000
-    ]
+        image_times(names, ColmapImportOptions())
+    assert image_times(names, ColmapImportOptions(time_unit="us")).tolist() == [1403715273262143000]
 
 
 def test_cameras_of_a_rig_that_are_microseconds_apart() -> None:
     names = tuple(
         f"cam{c}/{600_000_000_000 + 50_000_000 * k + 900 * c}.png" for k in range(4) for c in (0, 1)
     )
-    times_ns = image_times(names, "name", None, interval_s=1.0)
+    times_ns = image_times(names, ColmapImportOptions())
     assert times_ns[:3].tolist() == [600_000_000_000, 600_000_000_900, 600_050_000_000]
 
 
@@ -356,9 +354,10 @@ def test_a_file_of_stamps(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["image.png", "cam0/000123.png", "1" * 25 + ".png"])
 def test_names_without_stamp_are_refused(name: str) -> None:
     with pytest.raises(UserError, match="has no time stamp"):
-        image_times((name,), "name", None, interval_s=1.0)
+        image_times((name,), ColmapImportOptions())
 
 
 def test_frames_share_the_time_of_their_order() -> None:
     names = ("left/2.png", "right/1.png", "left/1.png")
-    assert image_times(names, "order", None, interval_s=2.0).tolist() == [4e9, 2e9, 2e9]
+    options = ColmapImportOptions(timestamps_from="order", order_interval_s=2.0)
+    assert image_times(names, options).tolist() == [4e9, 2e9, 2e9]
