@@ -9,15 +9,9 @@ from pathlib import Path
 
 from maplab_py.errors import Cancelled, UserError
 from maplab_py.pipeline import engines, fingerprint, messages, records
+from maplab_py.pipeline import progress as report
 from maplab_py.pipeline.options import PipelineOptions
 from maplab_py.pipeline.plan import MAPS, Pipeline, Stage, ordered
-from maplab_py.pipeline.progress import (
-    FailedTask,
-    PipelineReport,
-    StageLine,
-    StageState,
-    Watcher,
-)
 from maplab_py.storage.cache.map_cache import program_version
 
 _AGAIN = (messages.Ending.FAILED, messages.Ending.LOST)
@@ -49,7 +43,7 @@ class _Progress:
     """A stage while the pipeline runs."""
 
     stage: Stage
-    state: StageState
+    state: report.StageState
     tasks: dict[str, records.Task] = dataclasses.field(default_factory=dict)
     finished: list[records.Task] = dataclasses.field(default_factory=list)
     is_complete: bool = False  # no task can be added any more
@@ -69,7 +63,11 @@ class Driver:
     """
 
     def __init__(
-        self, pipeline: Pipeline, settings: RunSettings, engine: engines.Engine, watcher: Watcher
+        self,
+        pipeline: Pipeline,
+        settings: RunSettings,
+        engine: engines.Engine,
+        watcher: report.Watcher,
     ) -> None:
         """Check the pipeline and what an earlier run has left.
 
@@ -81,7 +79,7 @@ class Driver:
         self._engine = engine
         self._watcher = watcher
         stages = ordered(pipeline)
-        self._stages = {s.name: _Progress(s, StageState(s.name)) for s in stages}
+        self._stages = {s.name: _Progress(s, report.StageState(s.name)) for s in stages}
         self._records = records.Records(settings.results)
         self._version = program_version()
         self._ready: deque[records.Task] = deque()
@@ -90,11 +88,11 @@ class Driver:
         self._attempts: dict[str, int] = {}
         self._inputs: dict[str, tuple[tuple[str, str], ...]] = {}
         self._hashes: dict[Path, str] = {}
-        self._failed: list[FailedTask] = []
+        self._failed: list[report.FailedTask] = []
         self._is_stopping = False
         self._check_earlier_results()
 
-    def run(self) -> PipelineReport:
+    def run(self) -> report.PipelineReport:
         """Run all tasks; the engine has been started.
 
         Raises:
@@ -113,10 +111,12 @@ class Driver:
             is_missing = not progress.is_complete and not progress.tasks
             not_run = s.waiting + (1 if is_missing else 0)
             lines.append(
-                StageLine(s.stage, s.done, s.kept, s.failed, not_run, s.seconds, s.peak_gb)
+                report.StageLine(s.stage, s.done, s.kept, s.failed, not_run, s.seconds, s.peak_gb)
             )
         seconds = time.monotonic() - start
-        return PipelineReport(tuple(lines), tuple(self._failed), self.settings.results, seconds)
+        return report.PipelineReport(
+            tuple(lines), tuple(self._failed), self.settings.results, seconds
+        )
 
     def _check_earlier_results(self) -> None:
         options, results = self.settings.options, self.settings.results
@@ -294,7 +294,7 @@ class Driver:
         else:
             state.failed += 1
             log = self._records.path(task, ".log")
-            self._failed.append(FailedTask(task.title, outcome.error, log))
+            self._failed.append(report.FailedTask(task.title, outcome.error, log))
             self._watcher.line(f"{task.title}: failed: {outcome.error}")
             self._is_stopping = not self.settings.keep_going
         self._watcher.states([each.state for each in self._stages.values()])
@@ -322,7 +322,7 @@ def _maps_below(task: records.Task) -> list[Path]:
     return maps
 
 
-_SILENT = Watcher()
+_SILENT = report.Watcher()
 _DEFAULTS = PipelineOptions()
 
 
@@ -334,8 +334,8 @@ def run_pipeline(
     flags: Mapping[str, str] | None = None,
     keep_going: bool = False,
     discard: bool = False,
-    watcher: Watcher = _SILENT,
-) -> PipelineReport:
+    watcher: report.Watcher = _SILENT,
+) -> report.PipelineReport:
     """Run a pipeline: every task in a fresh process of the console.
 
     A program that calls this with `local:N` needs the usual guard, `if __name__ == "__main__":`, as

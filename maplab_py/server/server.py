@@ -252,7 +252,7 @@ class MapServer:
             return True
         if self._publish_if_needed(force=True):
             return True
-        if self._joint_is_due():
+        if self.incremental.full_optimization_every_nth > 0 and self.journal.since_joint > 0:
             pause = _Pause(self._progress, lambda: is_to_end() or self._has_work())
             if self._optimize_jointly(pause):
                 self._publish_if_needed(force=True, compress=True)
@@ -347,9 +347,6 @@ class MapServer:
         if is_nth or (is_new_robot and self.options.reset_trust_region_radius_if_new_robot):
             self._merger.radius = 0.0
             self.journal = dataclasses.replace(self.journal, since_reset=0, radius=0.0)
-
-    def _joint_is_due(self) -> bool:
-        return self.incremental.full_optimization_every_nth > 0 and self.journal.since_joint > 0
 
     def _optimize_jointly(self, progress: Progress) -> bool:
         """Optimise the whole map; False where new work has interrupted it."""
