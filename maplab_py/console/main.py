@@ -9,8 +9,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from maplab_py import kernel_cache
-from maplab_py.child_processes import end_with_parent
+from maplab_py import child_processes, kernel_cache
 from maplab_py.console.commands.flag_types import expand_path
 from maplab_py.console.commands.flags import looks_like_flag, normalise, parse_words
 from maplab_py.console.commands.registry import Registry, load_registry
@@ -20,8 +19,7 @@ from maplab_py.console.scripts.runner import Runner
 from maplab_py.console.session import log, paths, settings
 from maplab_py.console.session.session import Session
 from maplab_py.console.session.status import Status
-from maplab_py.console.terminal import streams
-from maplab_py.console.terminal.foreground import abandoned_commands_run
+from maplab_py.console.terminal import foreground, streams
 from maplab_py.console.terminal.output import ConsoleTerminal
 from maplab_py.errors import FlagError, MaplabError, UserError
 from maplab_py.pipeline.options import PipelineOptions
@@ -143,10 +141,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Words behind the program's name. When they are not given, those of the process are
             taken, and the process ends here if an abandoned command still runs.
     """
-    end_with_parent()
+    child_processes.end_with_parent()
     streams.open_closed_streams()
     status = _main(sys.argv[1:] if argv is None else argv)
-    if argv is None and abandoned_commands_run():
+    if argv is None and foreground.abandoned_commands_run():
         with contextlib.suppress(OSError, ValueError):
             sys.stdout.flush()
             sys.stderr.flush()

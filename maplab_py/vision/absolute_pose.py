@@ -139,15 +139,10 @@ def search_level(
     tilt_sigma_rad: float = 0.02,
 ) -> LevelSolutions:
     """Estimate poses as `solve_poses` does, for queries already rotated to W."""
-    from maplab_py.vision.pose_kernels import (
-        MatchColumns,
-        PoseColumns,
-        SearchSettings,
-        search_poses,
-    )
+    from maplab_py.vision import pose_kernels
 
     count = len(problems.key)
-    matches = MatchColumns(
+    matches = pose_kernels.MatchColumns(
         problems.start,
         _mixed_seeds(problems.key, seed),
         problems.origin_W,
@@ -156,7 +151,7 @@ def search_level(
         problems.keypoint,
         1.0 / problems.tolerance,
     )
-    poses = PoseColumns(
+    poses = pose_kernels.PoseColumns(
         R_M_W=np.tile(np.eye(3), (count, 1, 1)),
         p_M_W=np.zeros((count, 3)),
         information=np.empty((count, 6, 6)),
@@ -164,7 +159,9 @@ def search_level(
         inlier_count=np.empty(count, dtype=np.int64),
         is_inlier=np.zeros(len(problems.keypoint), dtype=np.bool_),
     )
-    search_poses(matches, SearchSettings(max_iterations, 1.0 / tilt_sigma_rad), poses)
+    pose_kernels.search_poses(
+        matches, pose_kernels.SearchSettings(max_iterations, 1.0 / tilt_sigma_rad), poses
+    )
     return LevelSolutions(*poses)
 
 

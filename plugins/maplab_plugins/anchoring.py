@@ -30,9 +30,7 @@ def anchor_all_missions(
     """
     from maplab_py.algorithms.anchoring.anchoring import anchor_missions
 
-    return context.apply(
-        anchor_missions, options, loop_options, absolute=absolute_options, progress=context.progress
-    )
+    return context.apply(anchor_missions, options, loop_options, absolute=absolute_options)
 
 
 @command("anchor_mission", "am", example="am --map_mission=59f0", see_also=("anchor_all_missions",))
@@ -53,7 +51,6 @@ def anchor_mission(
     an approximate one that selects the alignment with another mission.
 
     Args:
-        map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
         to: Known mission; the alignment with it that is nearest to --T_G_M is used.
         T_G_M: Pose of the mission's frame in the global frame: x y z [m] and yaw [deg], "1 2 0 90".
     """
@@ -77,7 +74,6 @@ def anchor_mission(
         missions=np.array([row]),
         choice=choice,
         absolute=absolute_options,
-        progress=context.progress,
     )
 
 

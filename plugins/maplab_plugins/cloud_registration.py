@@ -31,5 +31,4 @@ def register_point_clouds(
         context.map_folder or Path(),
         options,
         missions=missions.rows(context.vi_map),
-        progress=context.progress,
     )

@@ -153,7 +153,6 @@ def export_trajectory_to_csv(
         pose_export_reference_sensor_id: Sensor or camera whose poses are written; empty = IMU.
         interpolate_to_imu_timestamps: Write a state at every IMU sample, not only at vertices.
         map_mission: Mission id or unambiguous prefix; empty = all missions.
-        overwrite: Replace the file if it exists.
     """
     from maplab_py.interop import vertex_states as states_io
 
@@ -195,9 +194,7 @@ def export_ncamera_calibration(
         overwrite: Replace files that exist.
     """
     from maplab_py.output_files import check_writable, write_text
-    from maplab_py.sensors import CameraRig
-    from maplab_py.sensors.sensors_yaml import sensor_entry
-    from maplab_py.sensors.yaml_text import dump_yaml
+    from maplab_py.sensors import CameraRig, sensors_yaml, yaml_text
 
     folder = ncamera_calibration_export_folder
     rigs = [s for s in context.vi_map.sensors.sensors.values() if isinstance(s, CameraRig)]
@@ -207,7 +204,7 @@ def export_ncamera_calibration(
     for path in paths:
         check_writable(path, overwrite=overwrite)
     for path, rig in zip(paths, rigs, strict=True):
-        write_text(path, [dump_yaml(sensor_entry(rig))], overwrite=overwrite)
+        write_text(path, [yaml_text.dump_yaml(sensors_yaml.sensor_entry(rig))], overwrite=overwrite)
     return WrittenFiles(paths, len(paths))
 
 
@@ -226,7 +223,6 @@ def export_mission_info(
 
     Args:
         mission_info_export_path: File to write.
-        overwrite: Replace the file if it exists.
     """
     from maplab_py.output_files import write_text
     from maplab_py.sensors.yaml_text import dump_yaml
@@ -259,14 +255,13 @@ def recording_info(
         recording: EuRoC or TUM-VI folder, ROS 1 bag, or file or folder of a ROS 2 bag.
         check_images: Check size and completeness of all images, and list those whose files are missing.
     """
-    from maplab_py.interop.recordings.reader_choice import open_recording
-    from maplab_py.interop.recordings.summary import summarise
+    from maplab_py.interop.recordings import reader_choice, summary
 
     if check_images:  # which lists all images that are missing
         reading = dataclasses.replace(source.reading, skip_missing_images=True)
         source = dataclasses.replace(source, reading=reading)
-    return summarise(
-        open_recording(recording, source),
+    return summary.summarise(
+        reader_choice.open_recording(recording, source),
         stream,
         check_images=check_images,
         progress=context.progress,
@@ -299,10 +294,8 @@ def check_recording(
     Args:
         recording: EuRoC or TUM-VI folder, ROS 1 bag, or file or folder of a ROS 2 bag.
         apply: Write here, as sensors.yaml, the calibration with what could be determined.
-        overwrite: Replace the file if it exists.
     """
-    from maplab_py.algorithms.recording_check.correction import correct
-    from maplab_py.algorithms.recording_check.doctor import diagnose, report
+    from maplab_py.algorithms.recording_check import correction, doctor
     from maplab_py.interop.recordings.reader_choice import open_recording
     from maplab_py.output_files import check_writable, write_text
     from maplab_py.sensors.sensors_yaml import write_sensors
@@ -310,11 +303,11 @@ def check_recording(
     if apply is not None:
         check_writable(apply, overwrite=overwrite)
     opened = open_recording(recording, source)
-    diagnosis = diagnose(opened, stream, progress=context.progress)
-    checked = report(diagnosis, opened)
+    diagnosis = doctor.diagnose(opened, stream, progress=context.progress)
+    checked = doctor.report(diagnosis, opened)
     if apply is None:
         return checked
-    corrected = correct(diagnosis)
+    corrected = correction.correct(diagnosis)
     write_text(apply, [write_sensors(corrected.device.sensors)], overwrite=overwrite)
     notes = (*checked.notes, *corrected.notes)
     return dataclasses.replace(checked, sensors_file=apply, notes=notes)

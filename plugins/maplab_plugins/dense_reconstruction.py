@@ -16,11 +16,9 @@ from maplab_py.plugin import (
 )
 
 if TYPE_CHECKING:
-    from maplab_py.algorithms.dense.clouds import ConvertedDepthMaps
-    from maplab_py.algorithms.dense.field import FieldsReport
+    from maplab_py.algorithms.dense import clouds, field, meshing, reconstruction
     from maplab_py.algorithms.dense.fusion import FusionReport
-    from maplab_py.algorithms.dense.meshing import MeshReport
-    from maplab_py.algorithms.dense.reconstruction import StereoReport
+
 
 _STEREO, _SGBM, _BM = (
     dense_options.StereoOptions(),
@@ -45,7 +43,7 @@ def stereo_dense_reconstruction(
     stereo: dense_options.StereoOptions = _STEREO,
     sgbm: dense_options.SgbmOptions = _SGBM,
     bm: dense_options.BmOptions = _BM,
-) -> StereoReport:
+) -> reconstruction.StereoReport:
     """Compute depth from the stereo images of every vertex, by OpenCV's block matching.
 
     Images of every camera model are rectified. Pixels that the right image, or the depth of
@@ -65,7 +63,6 @@ def stereo_dense_reconstruction(
         StereoSettings(stereo, sgbm, bm),
         output_type=dense_depth_resource_output_type,
         overwrite=overwrite,
-        progress=context.progress,
     )
 
 
@@ -73,16 +70,14 @@ def stereo_dense_reconstruction(
     "convert_all_depth_maps_to_point_clouds",
     see_also=("stereo_dense_reconstruction", "visualize_xyzrgbn_pointclouds"),
 )
-def convert_all_depth_maps_to_point_clouds(context: CommandContext) -> ConvertedDepthMaps:
+def convert_all_depth_maps_to_point_clouds(context: CommandContext) -> clouds.ConvertedDepthMaps:
     """Make a point cloud of every depth map, with colours where its frame has an image.
 
     Frames that have a cloud keep it. The files are written into the map when it is saved.
     """
     from maplab_py.algorithms.dense.clouds import convert_depth_maps
 
-    return context.apply(
-        convert_depth_maps, context.map_folder or Path(), progress=context.progress
-    )
+    return context.apply(convert_depth_maps, context.map_folder or Path())
 
 
 @command(
@@ -177,7 +172,7 @@ def create_esdf_from_depth_resource(
     dense_tsdf_mesh_min_weight: float = dense_options.MESH_MIN_WEIGHT,
     dense_max_memory_gb: float = 0.0,
     overwrite: bool = False,
-) -> FieldsReport:
+) -> field.FieldsReport:
     """Compute the distance of every voxel that cameras have seen from the nearest surface.
 
     Depth is fused as by create_tsdf_from_depth_resource, together with the free space in front of the
@@ -234,7 +229,7 @@ def create_mesh_from_tsdf_grid(
     dense_tsdf_mesh_min_weight: float = dense_options.MESH_MIN_WEIGHT,
     dense_result_mesh_colours: bool = False,
     overwrite: bool = False,
-) -> MeshReport:
+) -> meshing.MeshReport:
     """Write the surface of the grids as a triangle mesh, in the global frame.
 
     The surface passes only through cells all of whose eight voxels have been observed.

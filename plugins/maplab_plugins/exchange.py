@@ -122,7 +122,6 @@ def import_calibration(
         sensors_file: Write sensors.yaml for maplab here.
         apply: Give the calibration to the device of the map.
         apply_imu_noise: With --apply, take over the noise densities of the IMU, too.
-        overwrite: Replace the file if it exists.
     """
     from maplab_py.interop.calibration_import import import_calibration as read
     from maplab_py.sensors.sensors_yaml import write_sensors
@@ -239,7 +238,6 @@ def import_trajectory(
 
     Args:
         trajectory_file: File with the trajectory.
-        map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
         map_key: With --as=mission: name of a new map; empty = add the mission to the selected map, or to a
             new map of the file's name if there is none.
     """
@@ -261,11 +259,7 @@ def import_trajectory(
 def _measurements(
     context: CommandContext, trajectory: Trajectory, options: poses.TrajectoryOptions, mission: int
 ) -> poses.TrajectoryImport:
-    from maplab_py.algorithms.external_poses.trajectories import (
-        as_absolute_poses,
-        as_odometry,
-        clock_note,
-    )
+    from maplab_py.algorithms.external_poses import trajectories
     from maplab_py.vimap.queries import mission_labels
 
     before = context.vi_map
@@ -273,13 +267,15 @@ def _measurements(
     notes: list[str] = []
     count = int(before.vertex_start[mission + 1] - before.vertex_start[mission])
     if options.kind == "absolute":
-        after, missing, movement = as_absolute_poses(before, mission, trajectory, options)
+        after, missing, movement = trajectories.as_absolute_poses(
+            before, mission, trajectory, options
+        )
         moved_m, turned_deg = movement
         added = count - missing
     else:
-        after, missing, notes = as_odometry(before, mission, trajectory, options)
+        after, missing, notes = trajectories.as_odometry(before, mission, trajectory, options)
         added = count - 1 - missing
-    notes.append(clock_note(before, mission, trajectory, options))
+    notes.append(trajectories.clock_note(before, mission, trajectory, options))
     context.commit(after)
     return poses.TrajectoryImport(
         file=Path(trajectory.source),
@@ -298,18 +294,17 @@ def _new_mission(
     context: CommandContext, trajectory: Trajectory, options: poses.TrajectoryOptions, map_key: str
 ) -> poses.TrajectoryImport:
     from maplab_py.algorithms.external_poses.trajectories import as_mission
-    from maplab_py.vimap.ids import to_hex
-    from maplab_py.vimap.merge import merge_maps
+    from maplab_py.vimap import ids, merge
 
     vi_map = as_mission(trajectory, options)
     if map_key or not context.maps.selected_key:
         context.maps.add(map_key or Path(trajectory.source).stem, vi_map)
     else:
-        context.commit(merge_maps(context.vi_map, vi_map)[0])
+        context.commit(merge.merge_maps(context.vi_map, vi_map)[0])
     return poses.TrajectoryImport(
         file=Path(trajectory.source),
         kind="mission",
-        mission=to_hex(vi_map.missions.id[0])[:8],
+        mission=ids.to_hex(vi_map.missions.id[0])[:8],
         poses_in_file=len(trajectory),
         added=len(vi_map.vertices),
     )
@@ -336,7 +331,6 @@ def import_gps(
     Args:
         gps_file: CSV with time, latitude, longitude [deg] and ellipsoidal altitude [m], NMEA, or a bag of
             ROS 1 or ROS 2 with sensor_msgs/NavSatFix.
-        map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
     """
     from maplab_py.algorithms.external_poses.gps import attach_fixes
     from maplab_py.interop.gps import read_fixes
@@ -379,7 +373,6 @@ def import_wheel_odometry(
     Args:
         wheel_file: CSV with a header: time, then x, y, yaw or dx, dy, dyaw or vx, vy, wz [m, rad, s]; poses
             with qx, qy, qz, qw and velocities with wx, wy, wz are of all six directions.
-        map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
     """
     from maplab_py.algorithms.external_poses.wheels import attach_wheels
     from maplab_py.interop.wheel_odometry import read_wheel_odometry

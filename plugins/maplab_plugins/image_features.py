@@ -57,11 +57,7 @@ def extract_features(
     from maplab_py.algorithms.image_features.extraction import extract_features as extract
 
     return context.apply(
-        extract,
-        context.map_folder or Path(),
-        options,
-        missions=chosen.rows(context.vi_map),
-        progress=context.progress,
+        extract, context.map_folder or Path(), options, missions=chosen.rows(context.vi_map)
     )
 
 
@@ -82,6 +78,4 @@ def track_features(
     """
     from maplab_py.algorithms.image_features.tracks import track_features as track
 
-    return context.apply(
-        track, options, missions=chosen.rows(context.vi_map), progress=context.progress
-    )
+    return context.apply(track, options, missions=chosen.rows(context.vi_map))

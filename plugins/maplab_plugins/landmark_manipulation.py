@@ -14,9 +14,7 @@ def retriangulate_landmarks(
     """Triangulate all landmarks from their observations and evaluate their quality."""
     from maplab_py.algorithms.landmarks.triangulation import retriangulate
 
-    return context.apply(
-        retriangulate, options, missions=chosen.rows(context.vi_map), progress=context.progress
-    )
+    return context.apply(retriangulate, options, missions=chosen.rows(context.vi_map))
 
 
 @command("init_track_landmarks", "itl", example="itl")
@@ -29,9 +27,7 @@ def init_track_landmarks(
     """Create landmarks for feature tracks that have none, then triangulate all."""
     from maplab_py.algorithms.landmarks.tracks import init_tracks
 
-    return context.apply(
-        init_tracks, options, missions=chosen.rows(context.vi_map), progress=context.progress
-    )
+    return context.apply(init_tracks, options, missions=chosen.rows(context.vi_map))
 
 
 @command("evaluate_landmark_quality", "elq", example="elq --elq_min_observers=2")
@@ -44,9 +40,7 @@ def evaluate_landmark_quality(
     """Classify every landmark as good or bad."""
     from maplab_py.algorithms.landmarks.quality import evaluate_quality
 
-    return context.apply(
-        evaluate_quality, options, missions=chosen.rows(context.vi_map), progress=context.progress
-    )
+    return context.apply(evaluate_quality, options, missions=chosen.rows(context.vi_map))
 
 
 @command("reset_landmark_quality", "rlq", example="rlq")
@@ -56,9 +50,7 @@ def reset_landmark_quality(
     """Set the quality of all landmarks to unknown."""
     from maplab_py.algorithms.landmarks.quality import reset_quality
 
-    return context.apply(
-        reset_quality, missions=chosen.rows(context.vi_map), progress=context.progress
-    )
+    return context.apply(reset_quality, missions=chosen.rows(context.vi_map))
 
 
 @command("remove_bad_landmarks", "rbl", example="rbl")
@@ -68,9 +60,7 @@ def remove_bad_landmarks(
     """Remove all landmarks of quality bad; their keypoints stay."""
     from maplab_py.algorithms.landmarks.removal import remove_bad
 
-    return context.apply(
-        remove_bad, missions=chosen.rows(context.vi_map), progress=context.progress
-    )
+    return context.apply(remove_bad, missions=chosen.rows(context.vi_map))
 
 
 @command("remove_invalid_observations", "rio", example="rio --rio_max_reprojection_error_px=10")
@@ -84,8 +74,5 @@ def remove_invalid_observations(
     from maplab_py.algorithms.landmarks import removal
 
     return context.apply(
-        removal.remove_invalid_observations,
-        options,
-        missions=chosen.rows(context.vi_map),
-        progress=context.progress,
+        removal.remove_invalid_observations, options, missions=chosen.rows(context.vi_map)
     )

@@ -134,7 +134,7 @@ def _add_evidence(context: CommandContext, name: str, missions: NDArray[np.int64
             is_left_out[np.setdiff1d(np.arange(len(is_left_out)), missions)] = True
         add_evidence(context, name, remove_missions(context.vi_map, is_left_out))
         return
-    report = context.apply(gather_all, missions=missions, progress=context.progress)
+    report = context.apply(gather_all, missions=missions)
     tell_evidence(context, report, context.map_key)
 
 

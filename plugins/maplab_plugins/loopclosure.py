@@ -143,9 +143,7 @@ def loopclosure_all_missions(
     missions = context.mission_rows("", map_mission_list)
     report = _close(context, options, missions, as_edges=lc_insert_lc_edge_instead_of_merging)
     if evidence.gather_evidence:
-        gathered = context.apply(
-            gather_all, missions=missions, has_new_loops=True, progress=context.progress
-        )
+        gathered = context.apply(gather_all, missions=missions, has_new_loops=True)
         tell_evidence(context, gathered, context.map_key)
     return report
 
@@ -164,7 +162,6 @@ def loopclosure_one_mission(
 
     Args:
         lc_insert_lc_edge_instead_of_merging: Add loop closure edges instead of merging landmarks.
-        map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
     """
     missions = np.array([context.mission_row(map_mission)])
     return _close(context, options, missions, as_edges=lc_insert_lc_edge_instead_of_merging)
@@ -203,7 +200,6 @@ def train_projection_matrix(
         file: File to write; to be given as --lc_projection_matrix_filename.
         lc_target_dimensionality: Dimensions of the projected descriptors.
         map_mission_list: Missions to learn from, separated by commas; empty = all.
-        overwrite: Replace the file if it exists.
     """
     from maplab_py.algorithms.loop_closure.features import train_projection
     from maplab_py.vision.projection import save_projection
@@ -250,7 +246,6 @@ def lc_report(
         limit: Largest number of closures to list; 0 = all.
         file: Write all chosen closures to this file, JSON or CSV by its ending.
         map_mission_list: Only closures with an end in these missions, separated by commas.
-        overwrite: Replace the file if it exists.
     """
     from maplab_py.algorithms.loop_closure.listing import list_closures, write_closures
 
@@ -424,7 +419,7 @@ def _close(
     from maplab_py.algorithms.loop_closure.workflow import close_loops, insert_edges
 
     run = insert_edges if as_edges else close_loops
-    return context.apply(run, options, missions=missions, progress=context.progress)
+    return context.apply(run, options, missions=missions)
 
 
 def _relax(

@@ -17,9 +17,7 @@ def keyframe_heuristic(
     """Keep keyframes and remove the vertices between them; IMU and odometry edges are joined."""
     from maplab_py.algorithms.keyframing.heuristic import keyframe
 
-    return context.apply(
-        keyframe, options, missions=chosen.rows(context.vi_map), progress=context.progress
-    )
+    return context.apply(keyframe, options, missions=chosen.rows(context.vi_map))
 
 
 @command(
@@ -41,7 +39,6 @@ def landmark_sparsify(
     Args:
         num_landmarks_to_keep: Number of good landmarks to keep; bad landmarks are always removed.
         coverage_csv: File that gets the landmarks every keyframe sees before and after.
-        overwrite: Replace the file if it exists.
     """
     from maplab_py.algorithms.sparsification.sparsify import sparsify
     from maplab_py.output_files import check_writable, write_text

@@ -57,7 +57,6 @@ def update_map(
         keyframing,
         assign_new_ids=assign_new_ids,
         map_folder=context.map_folder,
-        progress=context.progress,
     )
 
 

@@ -21,7 +21,6 @@ def remove_mission(
     Args:
         map_mission: Mission id or unambiguous prefix.
         map_mission_list: Several, separated by commas.
-        yes: Do not ask for confirmation.
     """
     from maplab_py.vimap.edits import remove_missions
 

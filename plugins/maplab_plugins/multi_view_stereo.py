@@ -45,25 +45,21 @@ def export_colmap_mvs(
         only_good_landmarks: Leave out landmarks of bad quality.
         overwrite: Replace files that exist.
     """
-    from maplab_py.algorithms.dense.export import (
-        UndistortedViews,
-        UndistortionOptions,
-        write_colmap_workspace,
-    )
+    from maplab_py.algorithms.dense import export
 
     if colmap_max_image_size < 0 or every_nth < 1:
         raise UserError(
             f"--colmap_max_image_size={colmap_max_image_size}, --every_nth={every_nth}: must be at "
             "least 0 and 1"
         )
-    views = UndistortedViews(
+    views = export.UndistortedViews(
         context.vi_map,
         context.map_folder or Path(),
         missions.rows(context.vi_map),
-        UndistortionOptions(max_size_px=colmap_max_image_size),
+        export.UndistortionOptions(max_size_px=colmap_max_image_size),
         every_nth=every_nth,
     )
-    return write_colmap_workspace(
+    return export.write_colmap_workspace(
         views,
         colmap_workspace,
         only_good=only_good_landmarks,

@@ -33,11 +33,9 @@ def plot_trajectory(
     """Draw the missions from above, with their landmarks.
 
     Args:
-        plot_file: File to write; the suffix gives the format.
         plot_landmarks: Draw the landmarks too, bad landmarks in another colour.
         ground_truth: Draw this trajectory too (TUM, EuRoC or CSV), aligned with the vertices.
         map_mission_list: Missions to draw, separated by commas; empty = all.
-        overwrite: Replace the file if it exists.
     """
     from maplab_py.plotting import figure, maps
 
@@ -75,9 +73,7 @@ def plot_errors(
 
     Args:
         ground_truth: TUM, EuRoC or CSV file with stamped poses.
-        plot_file: File to write; the suffix gives the format.
         map_mission_list: Missions to draw, separated by commas; empty = all.
-        overwrite: Replace the file if it exists.
     """
     from maplab_py.interop.trajectories import read_trajectory
     from maplab_py.plotting import figure, time_series
@@ -106,9 +102,7 @@ def plot_landmarks(
     """Draw observation counts, distances and quality of the landmarks.
 
     Args:
-        plot_file: File to write; the suffix gives the format.
         map_mission_list: Missions whose landmarks count, separated by commas; empty = all.
-        overwrite: Replace the file if it exists.
     """
     from maplab_py.plotting import figure, maps
 
@@ -130,12 +124,7 @@ def plot_coobservability(
     plot_file: Path = Path("coobservability.png"),
     overwrite: bool = False,
 ) -> Plot:
-    """Draw how many landmarks each pair of missions shares.
-
-    Args:
-        plot_file: File to write; the suffix gives the format.
-        overwrite: Replace the file if it exists.
-    """
+    """Draw how many landmarks each pair of missions shares."""
     from maplab_py.plotting import figure, maps
 
     figure.check_plot_file(plot_file, overwrite=overwrite)
@@ -156,13 +145,7 @@ def plot_vi_states_of_mission(
     plot_file: Path = Path("vi_states.png"),
     overwrite: bool = False,
 ) -> Plot:
-    """Draw position, velocity and biases of a mission over time.
-
-    Args:
-        map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
-        plot_file: File to write; the suffix gives the format.
-        overwrite: Replace the file if it exists.
-    """
+    """Draw position, velocity and biases of a mission over time."""
     from maplab_py.plotting import figure, time_series
 
     figure.check_plot_file(plot_file, overwrite=overwrite)

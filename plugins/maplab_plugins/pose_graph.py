@@ -97,7 +97,6 @@ def export_g2o(
 
     Args:
         file: Text file to write.
-        overwrite: Replace the file if it exists.
     """
     from maplab_py.algorithms.relaxation.graph_files import graph_of_map
     from maplab_py.interop.g2o import write_g2o

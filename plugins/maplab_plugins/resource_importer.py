@@ -27,14 +27,9 @@ def import_images(
 
     Args:
         dataset_folder: Folder with mav0/cam0 or cam0; its calibration is not read.
-        map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
     """
     return context.apply(
-        images.import_images,
-        context.mission_row(map_mission),
-        dataset_folder,
-        options,
-        progress=context.progress,
+        images.import_images, context.mission_row(map_mission), dataset_folder, options
     )
 
 
@@ -57,7 +52,6 @@ def export_images(
 
     Args:
         dataset_folder: Folder that gets mav0.
-        map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
         resource_type: Number or name of the type of image or depth map.
         overwrite: Replace files that exist.
     """
@@ -95,7 +89,6 @@ def import_depth_maps(
 
     Args:
         depth_folder: Folder with the files.
-        map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
         camera: Index of the camera in its rig.
     """
     return context.apply(
@@ -104,7 +97,6 @@ def import_depth_maps(
         camera,
         depth_folder,
         options,
-        progress=context.progress,
     )
 
 
@@ -127,15 +119,8 @@ def import_point_clouds(
 
     Args:
         point_cloud_folder: Folder with the files.
-        map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
         sensor_id: Id or unambiguous prefix of the sensor; empty = the mission's lidar.
     """
     from maplab_py.interop.resources.point_clouds import import_point_clouds as attach
 
-    return context.apply(
-        attach,
-        context.mission_row(map_mission),
-        point_cloud_folder,
-        sensor_id,
-        progress=context.progress,
-    )
+    return context.apply(attach, context.mission_row(map_mission), point_cloud_folder, sensor_id)

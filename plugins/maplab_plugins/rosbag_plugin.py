@@ -74,7 +74,6 @@ def export_bag(
 
     Args:
         bag: File .bag of ROS 1, or folder of a ROS 2 bag.
-        map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
         overwrite: Replace a bag that exists.
     """
     from maplab_py.interop.bags.exporting import export_bag as write
@@ -167,10 +166,7 @@ def import_bag_resources(
 
     Args:
         rosbag_path: ROS 1 bag, or file or folder of a ROS 2 bag.
-        map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
     """
     from maplab_py.interop.bags.importing import import_bag_resources as attach
 
-    return context.apply(
-        attach, context.mission_row(map_mission), rosbag_path, options, progress=context.progress
-    )
+    return context.apply(attach, context.mission_row(map_mission), rosbag_path, options)

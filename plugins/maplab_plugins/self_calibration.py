@@ -23,14 +23,7 @@ from maplab_py.plugin import (
 from maplab_py.report import counted
 
 if TYPE_CHECKING:
-    from maplab_py.algorithms.self_calibration.reports import (
-        CalibrationComparison,
-        CollectionReport,
-        DatabaseReport,
-        InformationReport,
-        PruneReport,
-        SelfCalibrationReport,
-    )
+    from maplab_py.algorithms.self_calibration import reports
     from maplab_py.algorithms.self_calibration.segments.database import SegmentDatabase
     from maplab_py.online_calibration.suggestions import SuggestionReport
 
@@ -59,7 +52,7 @@ def self_calibrate(
     parts: int = 0,
     chosen: MissionChoice = ALL_MISSIONS,
     size: SizeOptions = SizeOptions(),
-) -> SelfCalibrationReport:
+) -> reports.SelfCalibrationReport:
     """Calibrate cameras and IMU on the most informative segments of the map and of a database.
 
     Args:
@@ -112,12 +105,8 @@ def collect_segments(
     options: SelfCalibrationOptions = SelfCalibrationOptions(),
     chosen: MissionChoice = ALL_MISSIONS,
     size: SizeOptions = SizeOptions(),
-) -> CollectionReport:
-    """Add the most informative segments of the map to a database file; it is created if missing.
-
-    Args:
-        database: Segment database.
-    """
+) -> reports.CollectionReport:
+    """Add the most informative segments of the map to a database file; it is created if missing."""
     from maplab_py.algorithms.self_calibration.segments.database import (
         locked_database,
         save_database,
@@ -147,12 +136,8 @@ def segment_database_stats(
     *,
     database: Path,
     size: SizeOptions = SizeOptions(),
-) -> DatabaseReport:
-    """Show tables, scores, parameters and segments of a segment database.
-
-    Args:
-        database: Segment database.
-    """
+) -> reports.DatabaseReport:
+    """Show tables, scores, parameters and segments of a segment database."""
     from maplab_py.algorithms.self_calibration.segments.database import load_database
     from maplab_py.algorithms.self_calibration.segments.selection import describe_database
 
@@ -178,11 +163,10 @@ def prune_segments(
     calibration: Path | None = None,
     probability: float = 0.999,
     size: SizeOptions = SizeOptions(),
-) -> PruneReport:
+) -> reports.PruneReport:
     """Remove segments: beyond a capacity, of some missions, or that contradict the calibration.
 
     Args:
-        database: Segment database.
         segments_per_group: Number of segments to keep per group; 0 = all.
         missions: Remove the segments of missions whose ids begin with these digits, separated by commas.
         outdated: Remove segments whose measurements contradict the calibration.
@@ -239,7 +223,6 @@ def suggest_motion(
     on those before. An open viewer shows the first as an arrow, and how much is known as a bar.
 
     Args:
-        database: Segment database.
         suggestions: Number of motions.
     """
     from maplab_plugins.visualization.following import NAME, Following
@@ -280,7 +263,6 @@ def export_segments(
     """Write the segments of a database as a map that can be loaded, looked at and optimised.
 
     Args:
-        database: Segment database.
         map_folder: Destination folder.
         overwrite: Replace a map that is there.
     """
@@ -308,7 +290,7 @@ def evaluate_segment_information(
     csv: Path | None = None,
     chosen: MissionChoice = ALL_MISSIONS,
     overwrite: bool = False,
-) -> InformationReport:
+) -> reports.InformationReport:
     """Show the information of every segment for each group of parameters; smaller is better.
 
     Args:
@@ -352,7 +334,7 @@ def apply_calibration(
     calibration: Path,
     chosen: MissionChoice = ALL_MISSIONS,
     size: SizeOptions = SizeOptions(),
-) -> CalibrationComparison:
+) -> reports.CalibrationComparison:
     """Apply the calibration of a sensors.yaml or of another map to the device; poses are unchanged.
 
     Args:
@@ -418,7 +400,7 @@ def compare_calibrations(
     calibration: Path,
     chosen: MissionChoice = ALL_MISSIONS,
     size: SizeOptions = SizeOptions(),
-) -> CalibrationComparison:
+) -> reports.CalibrationComparison:
     """Compare the calibration of the map's device with another, parameter by parameter.
 
     Args:

@@ -89,7 +89,6 @@ def push(
 
     Args:
         map_folder: Folder of the submap.
-        spool: Folder of the spool.
         robot_name: Robot that the submap comes from.
         name: Name in the spool; empty = that of the folder.
     """
@@ -113,7 +112,6 @@ def serve_status(
     """Tell what a map server has done, and what lies in its spool; also where no server runs.
 
     Args:
-        spool: Folder of the spool.
         wait_s: Wait up to so long [s] until a server has merged all that can be merged.
     """
     from maplab_py.server.client import NotRunning, ask
@@ -150,7 +148,6 @@ def serve_stop(context: CommandContext, *, spool: Path, wait_s: float = 0.0) -> 
     """Let a map server optimise its map jointly, publish it and end.
 
     Args:
-        spool: Folder of the spool.
         wait_s: Wait up to so long [s] for its end.
     """
     from maplab_py.server.client import order
@@ -180,7 +177,6 @@ def delete_mission(
     """Remove a mission from the map of a server for good; its later submaps are refused.
 
     Args:
-        spool: Folder of the spool.
         map_mission: Mission id or unambiguous beginning.
     """
     return _delete(spool, "delete_mission", mission=map_mission)
@@ -202,7 +198,6 @@ def delete_all_robot_missions(
     """Remove all missions of a robot from the map of a server; submaps of new ones are accepted.
 
     Args:
-        spool: Folder of the spool.
         robot_name: The robot.
     """
     return _delete(spool, "delete_all_robot_missions", robot_name=robot_name)
@@ -226,7 +221,6 @@ def map_lookup(
     """Ask a map server where a point that a robot's sensor saw is in the global frame.
 
     Args:
-        spool: Folder of the spool.
         robot_name: The robot.
         timestamp_ns: Time at which the point was seen.
         sensor: Id of the sensor; empty = the IMU.
@@ -269,11 +263,9 @@ def get_dense_map_in_range(
     The server looks into resources of the type --maplab_server_dense_map_resource_type.
 
     Args:
-        spool: Folder of the spool.
         center_G: Position in the global frame, "x y z" in metres.
         radius_m: Distance up to which points are wanted [m].
         output_file: PLY file that gets the points; empty = none.
-        overwrite: Replace the file if it exists.
     """
     import numpy as np
 
@@ -311,7 +303,6 @@ def simulate_robots(
     The truth of simulated sessions goes to truth.npz of the spool, for `evaluate_map`.
 
     Args:
-        spool: Folder of the spool.
         scenario: Name of a scenario (see list_scenarios), or a YAML file; each session is a robot.
         seed: Seed of all random numbers; empty = the seed of the scenario.
         maps_folder: Play the maps below this folder instead, as rovioli makes them of recordings; each

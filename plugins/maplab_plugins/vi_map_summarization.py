@@ -3,11 +3,7 @@
 from pathlib import Path
 
 from maplab_py.algorithms.loop_closure.options import FeatureTypeOptions
-from maplab_py.algorithms.summary.options import (
-    SummaryMapContent,
-    SummaryMapOptions,
-    SummaryMapReport,
-)
+from maplab_py.algorithms.summary import options as summary_options
 from maplab_py.input_files import SizeOptions
 from maplab_py.plugin import CommandContext, check_writable, command, write_bytes
 
@@ -23,17 +19,16 @@ def generate_summary_map_and_save_to_disk(
     context: CommandContext,
     summary_map_save_path: Path,
     *,
-    options: SummaryMapOptions = SummaryMapOptions(),
+    options: summary_options.SummaryMapOptions = summary_options.SummaryMapOptions(),
     features: FeatureTypeOptions = FeatureTypeOptions(),
     overwrite: bool = False,
-) -> SummaryMapReport:
+) -> summary_options.SummaryMapReport:
     """Write the good landmarks of the selected map and their descriptors to a summary map.
 
     Descriptors of one feature type are projected; observations with others are left out.
 
     Args:
         summary_map_save_path: Folder that gets the file localization_summary_map.
-        overwrite: Replace the file if it exists.
     """
     from maplab_py.algorithms.summary.summary import make_summary_map
     from maplab_py.storage.summary_map import FILE_NAME, summary_map_bytes
@@ -49,7 +44,7 @@ def generate_summary_map_and_save_to_disk(
     )
     data = summary_map_bytes(summary)
     write_bytes(file, [data], overwrite=overwrite)
-    return SummaryMapReport(
+    return summary_options.SummaryMapReport(
         landmarks=len(summary.p_G),
         observations=len(summary.descriptors),
         observers=len(summary.p_G_observer),
@@ -71,7 +66,7 @@ def print_summary_map(
     summary_map: Path,
     *,
     size: SizeOptions = SizeOptions(),
-) -> SummaryMapContent:
+) -> summary_options.SummaryMapContent:
     """Check a summary map and show its content.
 
     Args:

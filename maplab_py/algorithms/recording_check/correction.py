@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from maplab_py.algorithms.recording_check import doctor, inertial_checks, turn_checks
+from maplab_py.algorithms.recording_check import doctor, inertial_checks, rates, turn_checks
 from maplab_py.algorithms.recording_check.findings import Finding, Verdict
-from maplab_py.algorithms.recording_check.rates import CameraTurns
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.device import RecordedSensors
 from maplab_py.sensors import CameraRig, Imu
@@ -87,7 +86,7 @@ def _corrected_rig(diagnosis: doctor.Diagnosis) -> tuple[CameraRig, list[str]]:
     return dataclasses.replace(rig, cameras=tuple(models), T_B_C=T_B_C), notes
 
 
-def _delays(cameras: Sequence[CameraTurns]) -> list[float]:
+def _delays(cameras: Sequence[rates.CameraTurns]) -> list[float]:
     """Return the delays of the images [s], the same for all cameras that have the first one's clock.
 
     With delays that differ by their errors, images taken together would not be partners any more.

@@ -51,6 +51,16 @@ _OUTPUTS = (
     "recording",
 )
 """Flags that name what a command writes, maplab's names among them; a command has one of them at most."""
+_USUAL_HELP = {
+    "overwrite": "Replace the file if it exists.",
+    "map_mission": "Mission id or unambiguous prefix; may be omitted if the map has only one.",
+    "yes": "Do not ask for confirmation.",
+    "plot_file": "File to write; the suffix gives the format.",
+    "spool": "Folder of the spool.",
+    "database": "Segment database.",
+    "maps_folder": "Folder to search, with all sub-folders.",
+}
+"""Help of flags that mean the same in many commands, whose docstrings need not repeat it."""
 _SENDERS = ("push", "simulate_robots", "play_recording")
 """Commands that act outside, with a flag of such a name for what they read."""
 
@@ -136,7 +146,8 @@ def command(
     The first parameter receives the `CommandContext`. Keyword-only parameters are flags; others
     are flags that may also be given by position, as may the only required flag; `*words: str` takes
     all further words. A parameter whose type is an options dataclass becomes one flag per field, named
-    `flag_prefix` + field, or as the field's `flag` says. Flag help comes from `Args:`.
+    `flag_prefix` + field, or as the field's `flag` says. Flag help comes from `Args:`; usual flags such as
+    `overwrite` have help without.
 
     Args:
         name: maplab's name of the command.
@@ -258,7 +269,7 @@ def _flags_of(
         normalise(parameter.name).rstrip("_"),
         flag_type(hint),
         REQUIRED if parameter.default is parameter.empty else parameter.default,
-        documentation.get(parameter.name, ""),
+        documentation.get(parameter.name) or _USUAL_HELP.get(parameter.name, ""),
         path=(parameter.name,),
     )
 

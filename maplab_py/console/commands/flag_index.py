@@ -7,10 +7,9 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from importlib.util import find_spec
 
-from maplab_py.atomic import write_file
+from maplab_py import atomic, kernel_cache
 from maplab_py.console.commands.flags import CONSOLE_FLAGS, Flag
 from maplab_py.errors import MaplabError
-from maplab_py.kernel_cache import cache_root
 
 Index = Mapping[str, Sequence[str]]
 """Names of the plugins whose commands have a flag, by the flag's name."""
@@ -52,7 +51,7 @@ def kept_index(plugins: Iterable[str], make: Callable[[], tuple[Index, bool]]) -
         plugins: Names of the plugins.
         make: Makes the index, for which it imports all plugins; tells whether none of them is broken.
     """
-    path = cache_root() / "flags" / f"{_state_of_sources(plugins)}.json"
+    path = kernel_cache.cache_root() / "flags" / f"{_state_of_sources(plugins)}.json"
     try:
         index = json.loads(path.read_text(encoding="utf-8"))
         if isinstance(index, dict) and all(isinstance(names, list) for names in index.values()):
@@ -63,8 +62,8 @@ def kept_index(plugins: Iterable[str], make: Callable[[], tuple[Index, bool]]) -
     if not is_whole:
         return index
     with contextlib.suppress(OSError, MaplabError):  # else it is made again each time
-        cache_root().mkdir(mode=0o700, parents=True, exist_ok=True)
-        write_file(path, [json.dumps(index).encode()])
+        kernel_cache.cache_root().mkdir(mode=0o700, parents=True, exist_ok=True)
+        atomic.write_file(path, [json.dumps(index).encode()])
         for former in sorted(path.parent.glob("*.json"), key=os.path.getmtime)[:-_KEPT]:
             former.unlink()
     return index

@@ -4,8 +4,8 @@ import ast
 import collections.abc
 import dataclasses
 import functools
-import importlib
 import inspect
+import pkgutil
 import sys
 import threading
 import types
@@ -181,7 +181,7 @@ class _Names(dict[str, Any]):
 
     def __missing__(self, name: str) -> Any:
         module, original = _imported_names(self._module)[name]
-        return getattr(importlib.import_module(module), original)
+        return pkgutil.resolve_name(f"{module}.{original}")
 
 
 _PARSING = threading.Lock()

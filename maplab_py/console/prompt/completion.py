@@ -288,14 +288,13 @@ _MISSIONS: weakref.WeakKeyDictionary[VIMap, list[Value]] = weakref.WeakKeyDictio
 
 
 def _described_missions(vi_map: VIMap) -> list[Value]:
-    from maplab_py.vimap.ids import to_hex_list
-    from maplab_py.vimap.queries import mission_distances_m, mission_time_spans_ns
+    from maplab_py.vimap import ids, queries
 
     names = [str(name) for name in vi_map.missions.name]
     counts = Counter(names)
-    lengths, spans = mission_distances_m(vi_map), mission_time_spans_ns(vi_map)
+    lengths, spans = queries.mission_distances_m(vi_map), queries.mission_time_spans_ns(vi_map)
     values = []
-    for row, id_ in enumerate(to_hex_list(vi_map.missions.id)):
+    for row, id_ in enumerate(ids.to_hex_list(vi_map.missions.id)):
         start = dt.datetime.fromtimestamp(int(spans[row, 0]) // 10**9, tz=dt.UTC)
         is_unique = bool(names[row]) and counts[names[row]] == 1
         what = f"{id_[:8]}  {lengths[row]:.0f} m from {start:%Y-%m-%d %H:%M:%S}"

@@ -11,15 +11,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
-from maplab_py.atomic import write_file
-from maplab_py.cancellation import CancelToken
+from maplab_py import atomic, cancellation
 from maplab_py.console.commands.flag_types import expand_path
 from maplab_py.console.commands.lines import TypedCommand, typed_commands, variable_lookup
 from maplab_py.console.scripts import aliases, checking, costs
 from maplab_py.console.scripts.rescue import Rescue
+from maplab_py.console.session import jobs, paths
 from maplab_py.console.session.call import Call
-from maplab_py.console.session.jobs import Job
-from maplab_py.console.session.paths import remember_maps
 from maplab_py.console.session.session import Refusal, Session
 from maplab_py.console.session.status import Status, describe, status_of
 from maplab_py.console.terminal import foreground, output
@@ -235,7 +233,7 @@ class Runner:
         self.session.uses[words[0]] += 1
         self.terminal.echo_to_transcript("> " + command.source)
         start = time.perf_counter()
-        token = CancelToken()
+        token = cancellation.CancelToken()
         is_shown = True
         try:
             call = self.session.parse(words)
@@ -286,7 +284,7 @@ class Runner:
         """Note the folders of maps that were loaded or saved, for the greeting of the prompt."""
         folders = {entry.folder for entry in self.session.maps if entry.folder is not None}
         if not folders <= self._folders:
-            remember_maps(folders - self._folders)
+            paths.remember_maps(folders - self._folders)
             self._folders |= folders
 
     def _show(self, report: Report, name: str, seconds: float, *, in_shell: bool) -> bool:
@@ -304,7 +302,7 @@ class Runner:
         self.terminal.note(f"[{job.number}] {text} (see: jobs, join, cancel)")
         return Status.OK
 
-    def tell_of_job(self, job: Job) -> None:
+    def tell_of_job(self, job: jobs.Job) -> None:
         """Report that a job has finished; called in the thread of the job."""
         name = job.call.command.name
         text = f"[{job.number}] {name}: {job.state} after {format_seconds(job.elapsed_s)}"
@@ -352,7 +350,7 @@ class Runner:
         report = io.StringIO()
         with self.terminal.redirected(report):
             yield
-        write_file(path, [before + report.getvalue().encode()])
+        atomic.write_file(path, [before + report.getvalue().encode()])
 
     @contextmanager
     def _pipe(self, line: str) -> Iterator[None]:

@@ -12,9 +12,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from maplab_py.atomic import write_file
+from maplab_py import atomic, input_files
 from maplab_py.errors import UserError
-from maplab_py.input_files import read_text
 from maplab_py.report import to_html
 from maplab_py.storage import checksums
 from maplab_py.storage.map_saving import CARD_FILE
@@ -79,7 +78,7 @@ class Card:
                 f"{file}: there is no card: maps have one that a session of this version has saved"
             )
         try:
-            text = read_text(file, _MAX_BYTES, remedy="it is no card")
+            text = input_files.read_text(file, _MAX_BYTES, remedy="it is no card")
             return cls.from_dict(json.loads(text.partition(_BEGIN)[2].partition(_END)[0]))
         except (ValueError, KeyError, TypeError, RecursionError):
             raise UserError(f"{file}: is damaged, or no card: save the map again") from None
@@ -112,7 +111,7 @@ class Card:
             f"{_BEGIN}{content}{_END}\n"
         )
         # a name of a file may hold bytes that are no text
-        write_file(folder / CARD_FILE, [page.encode(errors="backslashreplace")])
+        atomic.write_file(folder / CARD_FILE, [page.encode(errors="backslashreplace")])
 
 
 def digest_of(path: Path) -> str:

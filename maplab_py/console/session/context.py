@@ -3,27 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Concatenate, ParamSpec, TypeVar
+
+import numpy as np
 
 from maplab_py.array_types import I64
 from maplab_py.console.session.maps import MapManager
 from maplab_py.console.terminal.protocol import Terminal
 from maplab_py.errors import UserError
+from maplab_py.options import Options
 from maplab_py.progress import Progress
 
 if TYPE_CHECKING:
     from maplab_py.console.session.session import Session
     from maplab_py.storage.native import DiskCopy
-    from maplab_py.vimap import VIMap
-from typing import TYPE_CHECKING
-
-import numpy as np
-
-from maplab_py.options import Options
-
-if TYPE_CHECKING:
     from maplab_py.vimap import VIMap
 
 
@@ -97,7 +93,12 @@ class CommandContext:
         *arguments: ArgumentsT.args,
         **named: ArgumentsT.kwargs,
     ) -> ReportT:
-        """Commit what an edit of the selected map returns, and return its report."""
+        """Commit what an edit of the selected map returns, and return its report.
+
+        An edit that reports its progress reports that of the command.
+        """
+        if "progress" in inspect.signature(edit).parameters:
+            named.setdefault("progress", self.progress)
         vi_map, report = edit(self.vi_map, *arguments, **named)
         self.commit(vi_map)
         return report

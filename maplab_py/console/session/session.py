@@ -14,7 +14,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from maplab_py.cancellation import current_token, lasting_effect
+from maplab_py import cancellation, memory, output_files
 from maplab_py.console.commands.lines import split_commands
 from maplab_py.console.commands.registry import Registry, load_registry
 from maplab_py.console.session import jobs, log, provenance, settings
@@ -23,8 +23,6 @@ from maplab_py.console.session.context import CommandContext
 from maplab_py.console.session.maps import MapEntry, MapManager, MapsState, merge_states
 from maplab_py.console.terminal.protocol import SilentTerminal, Terminal
 from maplab_py.errors import EstimationError
-from maplab_py.memory import memory_limited
-from maplab_py.output_files import planning, staging
 from maplab_py.report import Message, Report, to_html
 
 if TYPE_CHECKING:
@@ -213,9 +211,9 @@ class Session:
         try:
             command = call.command
             is_unguarded = command.acts_outside and not command.guards_effects
-            with lasting_effect() if is_unguarded else nullcontext():
+            with cancellation.lasting_effect() if is_unguarded else nullcontext():
                 report, result = self.compute(call, base, self.terminal)
-                with lasting_effect(is_last=not self._is_draft):
+                with cancellation.lasting_effect(is_last=not self._is_draft):
                     self.maps.state, _ = merge_states(base, result, self.maps.state)
         finally:
             self.watchers.after_command(self.maps)
@@ -239,12 +237,12 @@ class Session:
                 context = CommandContext(
                     draft, progress, terminal, command.name, is_trial=call.is_trial
                 )
-                with staging(enabled=not command.acts_outside) as staged:
+                with output_files.staging(enabled=not command.acts_outside) as staged:
                     report = _call(call, context, arguments)
-                    if context.has_drafts and not current_token().has_effects:
+                    if context.has_drafts and not cancellation.current_token().has_effects:
                         progress.check()
                     if staged.files:
-                        with lasting_effect():
+                        with cancellation.lasting_effect():
                             staged.publish()
             context.apply_drafts()
         finally:
@@ -304,10 +302,10 @@ class Session:
 def _call(call: Call, context: CommandContext, arguments: dict[str, Any]) -> Any:
     """Call the function; a trial lists the files instead of writing them."""
     words = _by_position(call, arguments)
-    with memory_limited(call.max_memory_gb):
+    with memory.memory_limited(call.max_memory_gb):
         if not call.is_trial:
             return call.command.function(context, *words, **arguments)
-        with planning() as planned:
+        with output_files.planning() as planned:
             report = call.command.function(context, *words, **arguments)
     for file in planned:
         context.terminal.note(str(file))

@@ -14,8 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, TextIO
 
-from maplab_py import kernel_cache
-from maplab_py.cancellation import current_token
+from maplab_py import cancellation, kernel_cache
 from maplab_py.console.terminal import drawing, foreground, layout, streams
 from maplab_py.console.terminal.render import (
     render,
@@ -59,7 +58,7 @@ class TerminalProgress:
         """
         self._position = position
         self._stream = stream
-        self._token = current_token()
+        self._token = cancellation.current_token()
         self._what = what
         self._is_live = wants_colour(stream)
         self._prints_lines = stream.isatty() or verbosity > 0

@@ -185,7 +185,6 @@ def doctor(
 
     Args:
         file: Write the page here, as HTML or JSON by its ending.
-        overwrite: Replace the file if it exists.
     """
     from maplab_py.algorithms.map_health import map_health
     from maplab_py.output_files import check_writable, write_text

@@ -119,11 +119,7 @@ def list_maps_on_file_system(
     context: CommandContext,  # noqa: ARG001
     maps_folder: Path,
 ) -> FolderList:
-    """List the map folders below a folder.
-
-    Args:
-        maps_folder: Folder to search, with all sub-folders.
-    """
+    """List the map folders below a folder."""
     return FolderList(maps_folder, tuple(str(p) for p in _folders_below(maps_folder)))
 
 
@@ -201,7 +197,6 @@ def load_all(
     """Load every map below a folder, each under the name of its folder; the last is selected.
 
     Args:
-        maps_folder: Folder to search, with all sub-folders.
         assign_new_ids: Give missions, vertices, landmarks and edges new ids.
     """
     from maplab_py.storage.native import disk_copy
@@ -267,7 +262,6 @@ def load_merge_all_maps(
     """Load every map below a folder and merge all missions into the selected map or a new one.
 
     Args:
-        maps_folder: Folder to search, with all sub-folders.
         target_map_key: Key of a new map for the result; empty = the selected map, or if there is
             none a new map named after the folder.
         assign_new_ids: Give the loaded missions, vertices, landmarks and edges new ids, so that
@@ -322,7 +316,6 @@ def load_merge_all_submaps(
     """Load the parts of missions below a folder in time order and join them.
 
     Args:
-        maps_folder: Folder to search, with all sub-folders.
         target_map_key: Key of a new map for the result; empty = the selected map, or if there is
             none a new map named after the folder.
         assign_new_ids: Give the joined missions, vertices, landmarks and edges new ids.

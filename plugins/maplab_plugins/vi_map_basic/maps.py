@@ -98,7 +98,6 @@ def delete_map(context: CommandContext, map_key: str = "", *, yes: bool = False)
 
     Args:
         map_key: Key of the map; empty = the selected one.
-        yes: Do not ask for confirmation.
     """
     key = map_key or context.map_key
     entry = context.maps.get(key)
@@ -110,11 +109,7 @@ def delete_map(context: CommandContext, map_key: str = "", *, yes: bool = False)
 
 @command("clear_storage", example="clear_storage --yes", see_also=("delete_map",), needs_map=False)
 def clear_storage(context: CommandContext, *, yes: bool = False) -> Message:
-    """Remove all maps from memory; their files stay.
-
-    Args:
-        yes: Do not ask for confirmation.
-    """
+    """Remove all maps from memory; their files stay."""
     count = len(context.maps)
     if not count:
         return Message("no maps in memory")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,28 +16,44 @@ if TYPE_CHECKING:
     from maplab_py.viewer.layers.clouds import Cloud
 
 
-@command("visualize_xyz_pointclouds", acts_outside=True, guards_effects=True)
-def visualize_xyz_pointclouds(
-    context: CommandContext,
-    *,
-    clouds: PointCloudOptions = PointCloudOptions(),
-    options: VisualizationOptions = VisualizationOptions(),
-    display: ViewerOptions = ViewerOptions(),
-) -> ViewReport:
-    """Show the clouds of plain points, coloured by height."""
-    return _show(context, "point_cloud", clouds, options, display)
+_INTENSITIES = "point_cloud_w_intensity"
 
 
-@command("visualize_xyzi_pointclouds", acts_outside=True, guards_effects=True)
-def visualize_xyzi_pointclouds(
-    context: CommandContext,
-    *,
-    clouds: PointCloudOptions = PointCloudOptions(),
-    options: VisualizationOptions = VisualizationOptions(),
-    display: ViewerOptions = ViewerOptions(),
-) -> ViewReport:
-    """Show the clouds whose points have intensities, as those of a lidar."""
-    return _show(context, "point_cloud_w_intensity", clouds, options, display)
+def _viewer(name: str, resource: str, what: str) -> Callable[..., ViewReport]:
+    """Make the command that shows the clouds of one type of resource."""
+
+    def view(
+        context: CommandContext,
+        *,
+        clouds: PointCloudOptions = PointCloudOptions(),
+        options: VisualizationOptions = VisualizationOptions(),
+        display: ViewerOptions = ViewerOptions(),
+    ) -> ViewReport:
+        return _show(context, resource, clouds, options, display)
+
+    view.__doc__ = f"Show the {what}."
+    return command(name, acts_outside=True, guards_effects=True)(view)
+
+
+visualize_xyz_pointclouds = _viewer(
+    "visualize_xyz_pointclouds", "point_cloud", "clouds of plain points, coloured by height"
+)
+visualize_xyzi_pointclouds = _viewer(
+    "visualize_xyzi_pointclouds",
+    _INTENSITIES,
+    "clouds whose points have intensities, as those of a lidar",
+)
+visualize_xyzrgbn_pointclouds = _viewer(
+    "visualize_xyzrgbn_pointclouds", "color_point_cloud", "coloured clouds and meshes"
+)
+visualize_raw_depth_map_pointclouds = _viewer(
+    "visualize_raw_depth_map_pointclouds", "raw_depth_maps", "raw depth maps as points in space"
+)
+visualize_optimized_depth_map_pointclouds = _viewer(
+    "visualize_optimized_depth_map_pointclouds",
+    "optimized_depth_maps",
+    "optimised depth maps as points in space",
+)
 
 
 @command("visualize_xyzi_pointclouds_from_mission", acts_outside=True, guards_effects=True)
@@ -48,13 +65,9 @@ def visualize_xyzi_pointclouds_from_mission(
     options: VisualizationOptions = VisualizationOptions(),
     display: ViewerOptions = ViewerOptions(),
 ) -> ViewReport:
-    """Show the clouds with intensities of one mission.
-
-    Args:
-        map_mission: Mission id or unambiguous prefix; may be omitted if the map has only one.
-    """
+    """Show the clouds with intensities of one mission."""
     row = context.mission_row(map_mission)
-    return _show(context, "point_cloud_w_intensity", clouds, options, display, np.array([row]))
+    return _show(context, _INTENSITIES, clouds, options, display, np.array([row]))
 
 
 @command("visualize_xyzi_pointclouds_sequentially", acts_outside=True, guards_effects=True)
@@ -67,43 +80,7 @@ def visualize_xyzi_pointclouds_sequentially(
     display: ViewerOptions = ViewerOptions(),
 ) -> ViewReport:
     """Play the missions with their clouds with intensities."""
-    return _show(context, "point_cloud_w_intensity", clouds, options, display, playback=playback)
-
-
-@command("visualize_xyzrgbn_pointclouds", acts_outside=True, guards_effects=True)
-def visualize_xyzrgbn_pointclouds(
-    context: CommandContext,
-    *,
-    clouds: PointCloudOptions = PointCloudOptions(),
-    options: VisualizationOptions = VisualizationOptions(),
-    display: ViewerOptions = ViewerOptions(),
-) -> ViewReport:
-    """Show the coloured clouds and meshes."""
-    return _show(context, "color_point_cloud", clouds, options, display)
-
-
-@command("visualize_raw_depth_map_pointclouds", acts_outside=True, guards_effects=True)
-def visualize_raw_depth_map_pointclouds(
-    context: CommandContext,
-    *,
-    clouds: PointCloudOptions = PointCloudOptions(),
-    options: VisualizationOptions = VisualizationOptions(),
-    display: ViewerOptions = ViewerOptions(),
-) -> ViewReport:
-    """Show the raw depth maps as points in space."""
-    return _show(context, "raw_depth_maps", clouds, options, display)
-
-
-@command("visualize_optimized_depth_map_pointclouds", acts_outside=True, guards_effects=True)
-def visualize_optimized_depth_map_pointclouds(
-    context: CommandContext,
-    *,
-    clouds: PointCloudOptions = PointCloudOptions(),
-    options: VisualizationOptions = VisualizationOptions(),
-    display: ViewerOptions = ViewerOptions(),
-) -> ViewReport:
-    """Show the optimised depth maps as points in space."""
-    return _show(context, "optimized_depth_maps", clouds, options, display)
+    return _show(context, _INTENSITIES, clouds, options, display, playback=playback)
 
 
 def _show(

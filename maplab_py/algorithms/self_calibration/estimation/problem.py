@@ -22,10 +22,7 @@ from maplab_py.estimation.problem.problem import Problem
 from maplab_py.estimation.states import ACCEL_BIAS, GYRO_BIAS, VELOCITY, States
 from maplab_py.estimation.terms import cameras, inertial, prior, protocol
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import VIMap, observer_counts, random_ids
-from maplab_py.vimap.edits import content_rng
-from maplab_py.vimap.selection import keep_rows
-from maplab_py.vimap.tables import NO_ROW
+from maplab_py.vimap import VIMap, edits, observer_counts, random_ids, selection, tables
 from maplab_py.vimap.vertex_removal import move_landmarks
 
 
@@ -97,7 +94,7 @@ def build_segment_problem(
     partition = partitions(vi_map, options.min_shared_landmarks)
     vi_map = split_landmarks(vi_map, partition)
     has_parallax = parallax_rad(vi_map) >= np.deg2rad(options.min_parallax_deg)
-    vi_map = keep_rows(vi_map, landmarks=np.flatnonzero(has_parallax))
+    vi_map = selection.keep_rows(vi_map, landmarks=np.flatnonzero(has_parallax))
     parts = collect_terms(vi_map, vi_options(options, robust), missions=missions, progress=progress)
     states = parts.states
     parameters = parameters_of(parts.rig, len(parts.factors.imus), states, options)
@@ -245,18 +242,18 @@ def split_landmarks(vi_map: VIMap, partition: I64) -> VIMap:
     first_vertex[copy[::-1]] = vi_map.keypoint_vertex[rows][::-1]
     source = keys // count
     table = vi_map.landmarks.take(source)
-    new_landmark = np.full(len(vi_map.keypoints), NO_ROW, dtype=np.int32)
+    new_landmark = np.full(len(vi_map.keypoints), tables.NO_ROW, dtype=np.int32)
     new_landmark[rows] = copy
     is_copy = np.flatnonzero(np.concatenate([[False], source[1:] == source[:-1]]))
     ids = table.id.copy()
-    ids[is_copy] = random_ids(len(is_copy), content_rng(vi_map, "partitions"))
+    ids[is_copy] = random_ids(len(is_copy), edits.content_rng(vi_map, "partitions"))
     copied = vi_map.replace(
         landmarks=table.replace(id=ids),
         keypoints=vi_map.keypoints.replace(landmark=new_landmark),
     )
     moved = np.flatnonzero(partition[vi_map.landmarks.vertex[source]] != keys % count)
     copied = move_landmarks(copied, moved, first_vertex[moved])
-    return keep_rows(copied, landmarks=np.flatnonzero(observer_counts(copied) >= 2))
+    return selection.keep_rows(copied, landmarks=np.flatnonzero(observer_counts(copied) >= 2))
 
 
 def parallax_rad(vi_map: VIMap) -> F64:
