@@ -13,7 +13,6 @@ from maplab_py.report import counted
 from maplab_py.vimap import LandmarkQuality, VIMap, queries
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _QUALITY_COLOURS = {"UNKNOWN": "tab:gray", "BAD": "tab:red", "GOOD": "tab:green"}
@@ -48,7 +47,10 @@ def trajectories(
     figure = figures.new_figure(8.0, float(np.clip(8.0 * height / width, 2.5, 10.0)) + 0.7)
     axes = figure.subplots()
     if landmarks:
-        _draw_landmarks(axes, vi_map, chosen)
+        is_good = vi_map.landmarks.quality != LandmarkQuality.BAD
+        in_chosen = np.isin(vi_map.vertices.mission[vi_map.landmarks.vertex], chosen)
+        p_G = vi_map.p_G[figures.thinned(np.flatnonzero(is_good & in_chosen))]
+        axes.plot(*p_G[:, :2].T, ".", color="0.75", markersize=1.5, zorder=0)
     if p_G_truth is not None:
         axes.plot(*p_G_truth[:, :2].T, color="black", linewidth=0.8, label="truth")
     for row in chosen:
@@ -66,13 +68,6 @@ def trajectories(
     )
     figures.legend(axes, len(chosen))
     return figure
-
-
-def _draw_landmarks(axes: Axes, vi_map: VIMap, chosen: NDArray[np.int64]) -> None:
-    is_good = vi_map.landmarks.quality != LandmarkQuality.BAD
-    in_chosen = np.isin(vi_map.vertices.mission[vi_map.landmarks.vertex], chosen)
-    p_G = vi_map.p_G[figures.thinned(np.flatnonzero(is_good & in_chosen))]
-    axes.plot(*p_G[:, :2].T, ".", color="0.75", markersize=1.5, zorder=0)
 
 
 def landmark_histograms(vi_map: VIMap, missions: NDArray[np.int64] | None = None) -> Figure:

@@ -59,7 +59,8 @@ def measure(
     count = len(motion.v_G)
     rate = options.rate_hz
     force_I = _specific_force(options, motion)
-    warmth = _warmth(options, count)
+    time = np.arange(count) / options.rate_hz
+    warmth = 1.0 + options.warming_scale * -np.expm1(-time / options.warming_time_s)[:, None]
     gyro = warmth * np.einsum("ij,nj->ni", intrinsics.T_g, motion.w_I)
     gyro += options.g_sensitivity * force_I
     accel = warmth * np.einsum("ij,jk,nk->ni", intrinsics.T_a, intrinsics.R_A_I, force_I)
@@ -85,12 +86,6 @@ def _specific_force(options: ImuOptions, motion: MotionState) -> F64:
     # rigid body: a_A = a_I + alpha x p + w x (w x p)
     turning = np.cross(motion.w_I, np.cross(motion.w_I, arm))
     return np.asarray(force_I + np.cross(motion.alpha_I, arm) + turning)
-
-
-def _warmth(options: ImuOptions, count: int) -> F64:
-    """Return the scale factor (N, 1) of both sensors while the device warms up."""
-    time = np.arange(count) / options.rate_hz
-    return 1.0 + options.warming_scale * -np.expm1(-time / options.warming_time_s)[:, None]
 
 
 def _bias(count: int, sigma: float, walk: float, rate: float, rng: np.random.Generator) -> F64:

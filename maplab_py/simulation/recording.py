@@ -78,7 +78,8 @@ def record(
         together = tuple(s for s in scenario.sessions if s.keep_frame) if options.keep_frame else ()
         spline = motion_spline(options, scenario.world, seeds.motion, together)
     check_free_way(spline, world, f"sessions[{number}]")
-    lead_s = _lead_s(scenario)
+    readout = max(abs(c.line_delay_s) * c.height_px for c in scenario.cameras)
+    lead_s = max(abs(scenario.imu.time_offset_s), readout)
     samples = recorded_samples(options, lead_s)
     if samples is None:
         clock = _Clock.of(scenario, options.total_s, lead_s)
@@ -135,12 +136,6 @@ class _Clock:
         middle = 0.5 * (time_s[1:] + time_s[:-1])
         row = np.unique(np.searchsorted(middle, wanted))
         return cls(time_s - lead, row.astype(np.int64), lead)
-
-
-def _lead_s(scenario: Scenario) -> float:
-    """Return how long the body moves before the first sample and after the last one [s]."""
-    readout = max(abs(c.line_delay_s) * c.height_px for c in scenario.cameras)
-    return max(abs(scenario.imu.time_offset_s), readout)
 
 
 def _stamps(scenario: Scenario, clock: _Clock, rng: np.random.Generator) -> tuple[I64, I64]:

@@ -65,7 +65,12 @@ def keep_rows(
         else:
             landmarks = landmarks[vi_map.landmarks.vertex[landmarks] >= 0]
     if landmarks is not None and not _is_identity(landmarks, len(vi_map.landmarks)):
-        vi_map = _keep_landmarks(vi_map, landmarks)
+        new_landmark = renumbering(len(vi_map.landmarks), landmarks)
+        keypoints = vi_map.keypoints
+        vi_map = vi_map.replace(
+            landmarks=vi_map.landmarks.take(landmarks),
+            keypoints=keypoints.replace(landmark=new_landmark[keypoints.landmark]),
+        )
     return vi_map
 
 
@@ -120,20 +125,17 @@ def _keep_vertices(vi_map: VIMap, vertices: I64) -> VIMap:
     kept = kept[np.argsort(imu.from_vertex[kept], kind="stable")]
     if not _is_identity(kept, len(imu)):
         parts["imu_samples"] = vi_map.imu_samples.take(ragged_rows(vi_map.sample_start, kept))
+    start = starts_of_counts(np.bincount(table.mission, minlength=len(missions)))
     return vi_map.replace(
-        missions=missions.replace(root_vertex=_roots(table.mission, len(missions))),
+        missions=missions.replace(
+            root_vertex=np.where(np.diff(start) > 0, start[:-1], NO_ROW).astype(np.int32)
+        ),
         vertices=table,
         landmarks=vi_map.landmarks.replace(vertex=new_vertex[vi_map.landmarks.vertex]),
         absolute_poses=absolute.take(absolute.vertex >= 0),
         imu_edges=imu.take(kept),
         **parts,
     )
-
-
-def _roots(mission: I32, mission_count: int) -> I32:
-    """Return the first vertex row of every mission, `NO_ROW` where it has none."""
-    start = starts_of_counts(np.bincount(mission, minlength=mission_count))
-    return np.where(np.diff(start) > 0, start[:-1], NO_ROW).astype(np.int32)
 
 
 def _keep_frames(vi_map: VIMap, new_vertex: I32) -> VIMap:
@@ -153,13 +155,4 @@ def _keep_frames(vi_map: VIMap, new_vertex: I32) -> VIMap:
         frames=table.take(kept),
         keypoints=vi_map.keypoints.take(ragged_rows(vi_map.keypoint_start, kept)),
         resources=resources.replace(owner=owner).take(~by_frame | (owner >= 0)),
-    )
-
-
-def _keep_landmarks(vi_map: VIMap, landmarks: I64) -> VIMap:
-    new_landmark = renumbering(len(vi_map.landmarks), landmarks)
-    keypoints = vi_map.keypoints
-    return vi_map.replace(
-        landmarks=vi_map.landmarks.take(landmarks),
-        keypoints=keypoints.replace(landmark=new_landmark[keypoints.landmark]),
     )

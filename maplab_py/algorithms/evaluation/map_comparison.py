@@ -42,6 +42,7 @@ def compare_maps(first: VIMap, second: VIMap) -> MapComparisonReport:
     keypoints = _common_keypoints(first, second, *common["frames"])
     rows.append(_observations(first, second, *keypoints))
     position, rotation = _poses(first, second, *common["vertices"])
+    names = [field.name for field in dataclasses.fields(VIMap) if field.name != "metadata"]
     report = MapComparisonReport(
         rows=tuple(rows),
         position_m=position,
@@ -59,7 +60,9 @@ def compare_maps(first: VIMap, second: VIMap) -> MapComparisonReport:
         ),
         descriptors_differing=_descriptors(first, second, *keypoints),
         sensors_differing=_sensors(first, second),
-        is_identical=_is_identical(first, second),
+        is_identical=all(
+            comparison.is_same(getattr(first, name), getattr(second, name)) for name in names
+        ),
     )
     return dataclasses.replace(report, in_words=_in_words(report))
 
@@ -202,9 +205,3 @@ def _same_camera(a: Camera, b: Camera) -> bool:
         rtol=_ROUNDING,
         atol=_ROUNDING,
     )
-
-
-def _is_identical(first: VIMap, second: VIMap) -> bool:
-    """Return whether all tables and sensors are equal; metadata may differ."""
-    names = [field.name for field in dataclasses.fields(VIMap) if field.name != "metadata"]
-    return all(comparison.is_same(getattr(first, name), getattr(second, name)) for name in names)

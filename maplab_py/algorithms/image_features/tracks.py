@@ -67,7 +67,8 @@ def track_features(
     result = vi_map.replace(
         frames=frames.replace(present=present), keypoints=vi_map.keypoints.replace(track_id=ids)
     )
-    count = _track_count(vi_map, track, tracked)
+    mission = vi_map.vertices.mission[vi_map.keypoint_vertex[tracked]]
+    count = len(np.unique(np.stack([mission, track[tracked]]), axis=1).T)
     return result, FeatureTrackReport(
         feature_type=type_name(kind.feature_type),
         frame_pairs=len(links.per_pair),
@@ -188,8 +189,3 @@ def _numbers(vi_map: VIMap, rows: I64, part: I64) -> I64:
     number = np.empty(len(order), dtype=np.int64)
     number[order] = np.arange(len(order)) - starts[owner[order]]
     return np.asarray((largest[owner] + 1 + number)[part.reshape(-1)])
-
-
-def _track_count(vi_map: VIMap, track: I64, tracked: I64) -> int:
-    mission = vi_map.vertices.mission[vi_map.keypoint_vertex[tracked]]
-    return len(np.unique(np.stack([mission, track[tracked]]), axis=1).T)

@@ -137,13 +137,6 @@ def pose_errors(localizations: Localizations, reference: Reference, T_R_G: F64) 
     return position, orientation
 
 
-def _map_kind(database: LocalizationMap) -> str:
-    """Return the kind of a map in words, with the type of its descriptors unless they are binary."""
-    name = "full" if database.has_descriptors else "summary"
-    kind = database.projection.kind
-    return name if kind.is_binary else f"{name}, {descriptors.type_name(kind.feature_type)}"
-
-
 def describe(
     database: LocalizationMap,
     localizations: Localizations,
@@ -167,8 +160,10 @@ def describe(
     success = int(np.count_nonzero(position < success_error_m))
     localized = int(localizations.is_localized.sum())
     answered = [answer for answer in localizations.answers if answer.outcome is Outcome.LOCALIZED]
+    name = "full" if database.has_descriptors else "summary"
+    kind = database.projection.kind
     return localization_options.LocalizationReport(
-        map_kind=_map_kind(database),
+        map_kind=name if kind.is_binary else f"{name}, {descriptors.type_name(kind.feature_type)}",
         map_landmarks=len(database.p_G),
         map_observations=len(database.descriptors),
         queries=len(outcomes),

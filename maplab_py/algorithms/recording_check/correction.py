@@ -68,7 +68,8 @@ def _corrected_rig(diagnosis: doctor.Diagnosis) -> tuple[CameraRig, list[str]]:
         if fit is None or not camera.agrees:
             continue
         if _verdicts(diagnosis, "rotation of the extrinsics, camera " + str(row)) or (
-            _verdicts(diagnosis, "rotation of the extrinsics") and not _is_upright(camera.axes)
+            _verdicts(diagnosis, "rotation of the extrinsics")
+            and not np.array_equal(camera.axes, _AXES)
         ):
             R = camera.axes.T @ fit.R_I_C  # of the IMU's axes as recorded
             turn = so3.from_matrix(camera.R_I_C.T @ R)
@@ -127,7 +128,3 @@ def _corrected_imu(diagnosis: doctor.Diagnosis, imu: Imu) -> tuple[Imu, list[str
         imu = dataclasses.replace(imu, intrinsics=scaled)
         notes.append(f"T_g times {fit.scale:.3f}")
     return imu, notes
-
-
-def _is_upright(axes: np.ndarray) -> bool:
-    return bool(np.array_equal(axes, _AXES))

@@ -17,7 +17,6 @@ from maplab_py.algorithms.recording_check.findings import (
 from maplab_py.algorithms.recording_check.rates import CameraTurns, analyse_camera
 from maplab_py.algorithms.recording_check.signals import Signals, read_signals
 from maplab_py.algorithms.recording_check.timing_checks import cannot_work, check_times
-from maplab_py.array_types import F64
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
 from maplab_py.interop.recordings import map_replay, protocol
@@ -181,13 +180,11 @@ def _check_noise(signals: Signals, cameras: Sequence[CameraTurns]) -> Iterator[F
 def _stereo_fits(signals: Signals) -> list[stereo.StereoFit | None]:
     cameras, T_I_C = signals.device.cameras, signals.device.T_I_C
     return [
-        stereo.fit_stereo(points, (cameras[0], cameras[row]), _pose_between(T_I_C, row))
+        stereo.fit_stereo(
+            points, (cameras[0], cameras[row]), np.asarray(se3.relative(T_I_C[0], T_I_C[row]))
+        )
         for row, points in enumerate(signals.stereo, start=1)
     ]
-
-
-def _pose_between(T_I_C: F64, row: int) -> F64:
-    return np.asarray(se3.relative(T_I_C[0], T_I_C[row]))
 
 
 def _check_stereo(
@@ -210,7 +207,9 @@ def _check_stereo(
             yield Finding(check, observed, expected, Verdict.WRONG, remedy)
         elif fit.moved < _FITS_PX:
             observed += f", {fit.moved:.2f} px with camera {row} turned by {fit.turn_deg:.1f} deg"
-            which = _turned_camera(cameras, row)
+            errors = [float(np.linalg.norm(cameras[c].mounting_error)) for c in (0, row)]
+            # the gyroscope contradicts its mounting more
+            which = 0 if errors[0] > errors[1] else row
             remedy = f"the extrinsics of camera {which} (T_B_C, kalibr: T_cn_cnm1): calibrate the rig again"
             yield Finding(check, observed, expected, Verdict.WRONG, remedy)
         else:
@@ -218,12 +217,6 @@ def _check_stereo(
             which = _unlike_camera(cameras, row)
             remedy = f"the intrinsics or distortion of camera {which}: calibrate it again"
             yield Finding(check, observed, expected, Verdict.WRONG, remedy)
-
-
-def _turned_camera(cameras: Sequence[CameraTurns], row: int) -> int:
-    """Return the camera whose mounting the gyroscope contradicts more."""
-    errors = [float(np.linalg.norm(cameras[c].mounting_error)) for c in (0, row)]
-    return 0 if errors[0] > errors[1] else row
 
 
 def _unlike_camera(cameras: Sequence[CameraTurns], row: int) -> int:

@@ -105,7 +105,8 @@ def calibrate(
     solution = solve_twice(initial, options, missions, progress)
     problem, states = solution.problem, solution.states
     lost = partitions_without_scale(problem, states, initial)
-    rest = vertices_outside(problem, lost)
+    rows = problem.selection.vertices
+    rest = np.sort(rows[~np.isin(problem.partition[rows], lost)])
     if len(lost) and len(rest):
         submap = extract_submap(vi_map, rest)
         return _without_scale(
@@ -297,12 +298,6 @@ def partitions_without_scale(
     has_shrunk = np.all(after_m < _MIN_RATIO * before_m, axis=0)
     has_grown = np.all(_MIN_RATIO * after_m > before_m, axis=0)
     return np.flatnonzero(has_shrunk | has_grown)
-
-
-def vertices_outside(problem: SegmentProblem, partitions: I64) -> I64:
-    """Return the vertices (rows of the map, ascending) of all other partitions."""
-    rows = problem.selection.vertices
-    return np.sort(rows[~np.isin(problem.partition[rows], partitions)])
 
 
 def describe_partitions(problem: SegmentProblem, partitions: I64) -> tuple[str, ...]:

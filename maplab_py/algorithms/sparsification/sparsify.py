@@ -123,7 +123,11 @@ def coverage_problem(
     threshold = options.descriptor_dev_scoring_threshold
     weight = np.ones(len(landmarks))
     if options.weighted:
-        weight = landmark_weights(vi_map, landmarks, threshold_bits=threshold)
+        # the probability 1 - (1 - p)^n that one of n descriptors matches when it is observed again
+        deviation = descriptor_deviations(vi_map, landmarks) * _BITS_OF_THRESHOLD
+        stability = np.minimum(1.0, threshold / np.maximum(deviation, 1e-9))
+        seen = np.maximum(observer_counts(vi_map)[landmarks], 1)
+        weight = np.asarray(1.0 - (1.0 - _MATCH_CHANCE * stability) ** seen)
     available = np.bincount(keyframe, weight[landmark], minlength=len(vertices))
     wanted = float(options.min_keypoints_per_keyframe)
     problem = selection.CoverageProblem(
@@ -291,17 +295,6 @@ def landmark_scores(vi_map: VIMap, landmarks: I64, *, threshold_bits: float) -> 
     raw = observer_counts(vi_map)[landmarks] * stability * mission_counts(vi_map)[landmarks]
     top = float(np.percentile(raw, _TOP_PERCENTILE)) if len(raw) else 0.0
     return np.asarray(np.clip(raw / max(top, 1e-9), 0.0, 1.0))
-
-
-def landmark_weights(vi_map: VIMap, landmarks: I64, *, threshold_bits: float) -> F64:
-    """Return the probability (N,) in (0, 1] that a landmark is matched when it is observed again.
-
-    With n descriptors, each of which matches with probability p, it is 1 - (1 - p)^n.
-    """
-    deviation = descriptor_deviations(vi_map, landmarks) * _BITS_OF_THRESHOLD
-    stability = np.minimum(1.0, threshold_bits / np.maximum(deviation, 1e-9))
-    seen = np.maximum(observer_counts(vi_map)[landmarks], 1)
-    return np.asarray(1.0 - (1.0 - _MATCH_CHANCE * stability) ** seen)
 
 
 def mission_counts(vi_map: VIMap) -> I64:

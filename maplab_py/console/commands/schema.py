@@ -40,7 +40,9 @@ def line_schema(commands: list[Command]) -> dict[str, Any]:
     reports = {}
     for command in commands:
         check_cancelled()
-        reports[command.name] = report_schema(command, definitions)
+        kinds = report_types(command.function)
+        schemas = [_schema(kind, definitions) for kind in kinds]
+        reports[command.name] = schemas[0] if len(schemas) == 1 else {"anyOf": schemas}
     return {
         "$schema": DIALECT,
         "$id": f"maplab-report-{SCHEMA_VERSION}",
@@ -65,17 +67,6 @@ def line_schema(commands: list[Command]) -> dict[str, Any]:
         ],
         "$defs": definitions,
     }
-
-
-def report_schema(command: Command, definitions: dict[str, Any]) -> dict[str, Any]:
-    """Return the schema of a command's report; classes go to `definitions` by name.
-
-    Raises:
-        TypeError: The command does not say what it returns, or only that it is some `Report`.
-    """
-    kinds = report_types(command.function)
-    schemas = [_schema(kind, definitions) for kind in kinds]
-    return schemas[0] if len(schemas) == 1 else {"anyOf": schemas}
 
 
 def report_types(function: Callable[..., Any]) -> tuple[type[Report], ...]:

@@ -42,7 +42,8 @@ def complete(text: str, session: Session) -> list[Candidate]:
     current = Word("", len(text), len(text)) if at_new_word else words[-1]
     earlier = words if at_new_word else words[:-1]
     if words and words[-1].is_shell:
-        return _shell_paths(text)
+        start = max(text.rfind(character) for character in " \t!|;&=<>") + 1
+        return _path_candidates(text[start:], start, "")
     if words and (words[-1].is_redirection or (earlier and earlier[-1].is_redirection)):
         return _path_candidates(current.text, current.start, "")
     if not earlier:
@@ -63,12 +64,6 @@ def _commands(current: Word, session: Session) -> list[Candidate]:
     for name, line in session.aliases.items():
         candidates.append((name, Candidate(name, current.start, name, f"alias: {line}")))
     return _rank(current.text, candidates, session.uses)
-
-
-def _shell_paths(text: str) -> list[Candidate]:
-    """Complete the last word of a shell command as a path."""
-    start = max(text.rfind(character) for character in " \t!|;&=<>") + 1
-    return _path_candidates(text[start:], start, "")
 
 
 def _path_candidates(typed: str, start: int, before: str) -> list[Candidate]:

@@ -228,7 +228,9 @@ class Session:
             MaplabError: The command failed.
         """
         command, arguments = call.command, call.arguments()
-        draft = self._with_maps(MapManager(base), terminal)
+        draft = copy.copy(self)  # on which the command works
+        draft._is_draft = True
+        draft.maps, draft.terminal, draft.lock = MapManager(base), terminal, threading.RLock()
         if command.needs_map:
             _ = draft.maps.selected
         start = time.perf_counter()
@@ -290,13 +292,6 @@ class Session:
 
     def __dir__(self) -> list[str]:
         return sorted({*super().__dir__(), *(n for n in self.registry.names if n.isidentifier())})
-
-    def _with_maps(self, maps: MapManager, terminal: Terminal) -> Session:
-        """Return the session that a running command works on: a copy with a draft of the maps."""
-        inside = copy.copy(self)
-        inside._is_draft = True
-        inside.maps, inside.terminal, inside.lock = maps, terminal, threading.RLock()
-        return inside
 
 
 def _call(call: Call, context: CommandContext, arguments: dict[str, Any]) -> Any:

@@ -107,7 +107,7 @@ def run_in_foreground(
         while (request := _next(requests)) is not end:
             if request is not None:
                 request.fulfil()
-            elif pressed and _is_over(pressed[0]) and token.abandon():
+            elif pressed and time.monotonic() - pressed[0] > SECONDS_OF_GRACE and token.abandon():
                 ABANDONED.append(thread)
                 raise Cancelled("cancelled")
             while_waiting()
@@ -130,10 +130,6 @@ def _next(requests: queue.SimpleQueue[_Request]) -> _Request | None:
         return requests.get(timeout=_SECONDS_BETWEEN_LOOKS)
     except queue.Empty:
         return None
-
-
-def _is_over(pressed: float) -> bool:
-    return time.monotonic() - pressed > SECONDS_OF_GRACE
 
 
 class NotedInterrupts:

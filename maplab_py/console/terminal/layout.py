@@ -345,7 +345,8 @@ def format_column(values: Sequence[Any]) -> list[str]:
     sizes = [number for number in numbers if number > 0 and math.isfinite(number)]
     if not sizes or max(sizes) < _ROUNDING_NOISE:
         return [_format_plain(0.0 if _is_number(value) else value) for value in values]
-    if not _is_fixed_point(sizes):
+    low, high = _FIXED_POINT_RANGE
+    if not low <= max(sizes) < high:
         return [f"{value:.3e}" if _is_number(value) else _format_plain(value) for value in values]
     largest = max(_SIGNIFICANT_DIGITS - 1 - math.floor(math.log10(max(sizes))), 0)
     smallest = _LEAST_SIGNIFICANT_DIGITS - 1 - math.floor(math.log10(min(sizes)))
@@ -380,11 +381,6 @@ def _format_fixed(value: float, decimals: int) -> str:
 def _is_number(value: Any) -> bool:
     """Tell whether a cell is a finite number with a fraction."""
     return isinstance(value, (float, np.floating)) and math.isfinite(value)
-
-
-def _is_fixed_point(sizes: list[float]) -> bool:
-    low, high = _FIXED_POINT_RANGE
-    return max(sizes) >= low and max(sizes) < high
 
 
 def _format_plain(value: Any) -> str:

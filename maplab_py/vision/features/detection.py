@@ -196,14 +196,6 @@ def are_apart_before(uv: F64, distance_px: float) -> Mask:
     return is_apart
 
 
-def make_selection(
-    free: U8, cells: tuple[int, int], cell_limit: int, radius_px: float
-) -> Selection:
-    """Return an empty choice in a copy of the free places."""
-    count: I64 = np.zeros(cells, dtype=np.int64)
-    return Selection(free.copy(), count, cell_limit, 0, radius_px)
-
-
 def strengths(image: U8, uv: I64) -> F64:
     """Return the strengths (N,) of corners at whole pixels (N, 2); see `corner_strengths`."""
     strength = np.empty(len(uv))
@@ -262,7 +254,8 @@ class GridDetector:
             return np.zeros((0, 2))
         scaler = options.gridded_detector_cell_num_features_scaler
         limit = int(np.ceil(scaler * self._equal_share))
-        selection = make_selection(self._usable, self._cells, limit, self._radius_px)
+        count: I64 = np.zeros(self._cells, dtype=np.int64)
+        selection = Selection(self._usable.copy(), count, limit, 0, self._radius_px)
         occupy_all(selection, np.round(tracked_uv).astype(np.int64))
         selected = _select(image, self._corners(self._detector, image, self._part), selection, room)
         room -= len(selected)

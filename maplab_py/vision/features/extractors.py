@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from maplab_py.array_types import F32, F64, U8
+from maplab_py.array_types import F64, U8
 from maplab_py.vimap.descriptors import DescriptorDepth, FeatureType
 from maplab_py.vision.descriptors import DescriptorKind
 from maplab_py.vision.features.extension import ExtractedFeatures
@@ -53,18 +53,13 @@ def extract(name: str, image: U8, max_features: int) -> ExtractedFeatures:
     if descriptors is None:
         descriptors = np.zeros((0, size), dtype=np.uint8)
     elif name == "sift":
-        descriptors = _square_roots(descriptors)
+        total = descriptors.sum(axis=1, keepdims=True)  # bytes of square roots, 512 long
+        roots = np.sqrt(np.maximum(descriptors, 0.0) / np.maximum(total, 1e-9))
+        descriptors = np.asarray(np.clip(np.rint(_SIFT_LENGTH * roots), 0, 255), dtype=np.uint8)
     # ties are decided by place and direction, not by the order in which threads found them
     order = np.lexsort((rows[:, 4], rows[:, 0], rows[:, 1], -rows[:, 3]))[:max_features]
     uv_px: F64 = rows[order, :2]
     return ExtractedFeatures(uv_px, rows[order, 3], descriptors[order], rows[order, 2])
-
-
-def _square_roots(descriptors: F32) -> U8:
-    """Return SIFT descriptors (N, 128) as bytes of square roots, 512 long."""
-    total = descriptors.sum(axis=1, keepdims=True)
-    roots = np.sqrt(np.maximum(descriptors, 0.0) / np.maximum(total, 1e-9))
-    return np.asarray(np.clip(np.rint(_SIFT_LENGTH * roots), 0, 255), dtype=np.uint8)
 
 
 def _detector(name: str, max_features: int) -> Any:

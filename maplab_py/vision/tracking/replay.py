@@ -68,7 +68,10 @@ def tracked_images_of(
     """
     start, options = time.perf_counter(), options or TrackingOptions()
     poses = np.asarray(T_I_C, dtype=np.float64).reshape(-1, 7)
-    counts = _frame_counts(previous)
+    parts = previous.cameras if previous is not None else (CameraTracks.empty(),)
+    ids = np.concatenate([part.track_id for part in parts])
+    unique, first = np.unique(ids, return_index=True)
+    counts = unique, np.concatenate([part.num_frames for part in parts])[first]
     tracks = tuple(_camera_tracks(frame, counts) for frame in frames.frames)
     motions: list[motion.ImageMotion] = []
     for row, camera in enumerate(cameras):
@@ -89,14 +92,6 @@ def tracked_images_of(
     disparity_px, is_turn_only = motion.summarise(motions)
     spent_ms = {"tracks": 1e3 * (time.perf_counter() - start)}
     return TrackedImages(frames.time_ns, tracks, disparity_px, is_turn_only, spent_ms)
-
-
-def _frame_counts(previous: TrackedImages | None) -> tuple[I64, I64]:
-    """Return the ids of all tracks of the previous set, ascending, and their frame counts."""
-    parts = previous.cameras if previous is not None else (CameraTracks.empty(),)
-    ids = np.concatenate([part.track_id for part in parts])
-    unique, first = np.unique(ids, return_index=True)
-    return unique, np.concatenate([part.num_frames for part in parts])[first]
 
 
 def _camera_tracks(frame: TrackedKeypoints | None, counts: tuple[I64, I64]) -> CameraTracks:

@@ -28,7 +28,7 @@ from maplab_py.estimation.problem.trust_region import Schedule
 from maplab_py.estimation.states import States
 from maplab_py.estimation.terms.inertial import BiasWalkTerm, InertialTerm
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import VIMap, edits
+from maplab_py.vimap import edits
 
 _INITIAL_ITERATIONS = 8
 """Iterations before all landmarks are triangulated and outliers judged a second time."""
@@ -66,8 +66,11 @@ def solve_twice(
         options, num_iterations=_INITIAL_ITERATIONS, function_tolerance=_INITIAL_TOLERANCE
     )
     states, first = solve(initial, few, progress)
+    vi_map = apply_states(initial, states, vi_options(options))
+    rows = np.arange(len(vi_map.landmarks))
+    p_G, _, good = triangulate_keypoints(vi_map, vi_map.observations, vi_map.observation_start)
     problem = build_segment_problem(
-        _retriangulated(initial, states, options),
+        edits.with_p_G(vi_map, rows[good], p_G[good]),
         options,
         missions=missions,
         prior_mean=initial.states.blocks,
@@ -92,11 +95,13 @@ def solve_rejecting_outliers(
     tolerance = max(options.function_tolerance, _ROBUST_TOLERANCE)
     loose = dataclasses.replace(options, function_tolerance=tolerance)
     states, robust = solve(problem, loose, progress)
+    angle_rad = parallax_rad(apply_states(problem, states, vi_options(options)))
+    limit_rad = np.deg2rad(options.min_parallax_deg)
     track_test = reject_tracks_chi2(
         problem,
         states,
         options.inconsistent_probability,
-        _has_parallax(problem, states, options),
+        np.asarray(angle_rad[problem.selection.landmarks] >= limit_rad),
     )
 
     def refresh(_: int, now: States) -> bool:
@@ -129,23 +134,6 @@ def _minimise(
         schedule=Schedule.CERES,
     )
     return optimize_states(problem.problem, states, solver, progress, after_step)
-
-
-def _has_parallax(problem: SegmentProblem, states: States, options: SelfCalibrationOptions) -> Mask:
-    """Return which landmarks (L,) of the problem have parallax at the states."""
-    angle_rad = parallax_rad(apply_states(problem, states, vi_options(options)))
-    limit_rad = np.deg2rad(options.min_parallax_deg)
-    return np.asarray(angle_rad[problem.selection.landmarks] >= limit_rad)
-
-
-def _retriangulated(
-    problem: SegmentProblem, states: States, options: SelfCalibrationOptions
-) -> VIMap:
-    """Return the map at the states with every landmark triangulated from all its observations."""
-    vi_map = apply_states(problem, states, vi_options(options))
-    rows = np.arange(len(vi_map.landmarks))
-    p_G, _, good = triangulate_keypoints(vi_map, vi_map.observations, vi_map.observation_start)
-    return edits.with_p_G(vi_map, rows[good], p_G[good])
 
 
 def chi_square_per_freedom(problem: SegmentProblem, states: States) -> float:
