@@ -36,14 +36,8 @@ _SAME_M, _SAME_RAD = 1.5, 0.3
 """Distances of alignments that count as the same; drift separates them."""
 
 
-@dataclasses.dataclass(frozen=True)
-class ContestRule:
-    """Criteria for an alignment that wins."""
-
-    max_share: (
-        float  # stretches that only a rival explains, per stretch that only the best one does
-    )
-    min_sigmas: float = 2.0  # of the difference of the two numbers, as of a sign test
+_MIN_SIGMAS = 2.0
+"""Difference of two counts that is significant, in deviations of a sign test."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -135,14 +129,14 @@ def _nearest_alignment(contests: Sequence[Contest], choice: AlignmentChoice) -> 
 
 
 def decide(
-    vi_map: VIMap, pairs: list[MissionPair], stretch: I64, rule: ContestRule, names: list[str]
+    vi_map: VIMap, pairs: list[MissionPair], stretch: I64, max_share: float, names: list[str]
 ) -> list[Contest]:
     """Decide every pair of different missions.
 
     Args:
         pairs: Alignments of pairs; those of a mission and itself reveal places that look alike.
         stretch: Stretch (V,) of each vertex.
-        rule: Criteria.
+        max_share: Stretches that only a rival may explain, per stretch that only the winner does.
         names: Names of the missions, for reasons.
     """
     contests = []
@@ -155,21 +149,21 @@ def decide(
             unmatched = tuple(
                 unmatched_share(vi_map, pair, alignment, stretch) for alignment in pair.alignments
             )
-        reason = _rival(pair, unmatched, rule) or _hidden_rival(
-            vi_map, pair, confusions, rule, names
+        reason = _rival(pair, unmatched, max_share) or _hidden_rival(
+            vi_map, pair, confusions, max_share, names
         )
         contests.append(Contest(pair, -1 if reason else 0, reason, unmatched))
     return contests
 
 
-def _rival(pair: MissionPair, unmatched: tuple[float, ...], rule: ContestRule) -> str:
+def _rival(pair: MissionPair, unmatched: tuple[float, ...], max_share: float) -> str:
     """Return why the best alignment does not win against the others; empty if it does."""
     best = pair.alignments[0]
     for number, rival in enumerate(pair.alignments[1:], start=1):
         if is_refuted(unmatched[number], unmatched[0]):
             continue
         for side in (0, 1):
-            if not is_beaten(rival.stretches(side), best.stretches(side), rule):
+            if not is_beaten(rival.stretches(side), best.stretches(side), max_share):
                 return (
                     "places that look like other places: "
                     f"the best alignment explains {best.support} stretches of the trajectories, "
@@ -178,15 +172,15 @@ def _rival(pair: MissionPair, unmatched: tuple[float, ...], rule: ContestRule) -
     return ""
 
 
-def is_beaten(rival: I64, best: I64, rule: ContestRule) -> bool:
+def is_beaten(rival: I64, best: I64, max_share: float) -> bool:
     """Return whether one set of stretches has many that a rival lacks, and lacks hardly any."""
     ours, theirs = len(np.setdiff1d(best, rival)), len(np.setdiff1d(rival, best))
-    return is_significant(ours, theirs, rule) and theirs <= rule.max_share * ours
+    return is_significant(ours, theirs) and theirs <= max_share * ours
 
 
-def is_significant(ours: int, theirs: int, rule: ContestRule) -> bool:
-    """Return whether two counts differ by more than the deviations of a sign test that a rule asks for."""
-    return bool(ours - theirs >= rule.min_sigmas * np.sqrt(ours + theirs))
+def is_significant(ours: int, theirs: int) -> bool:
+    """Return whether two counts differ by more than the deviations of a sign test."""
+    return bool(ours - theirs >= _MIN_SIGMAS * np.sqrt(ours + theirs))
 
 
 _Confusion = tuple[MissionPair, F64, I64]
@@ -197,7 +191,7 @@ def _hidden_rival(
     vi_map: VIMap,
     pair: MissionPair,
     confusions: dict[int, list[_Confusion]],
-    rule: ContestRule,
+    max_share: float,
     names: list[str],
 ) -> str:
     """Return which mission shows that the places of the best alignment look like others."""
@@ -207,7 +201,7 @@ def _hidden_rival(
             if other is pair:
                 continue
             shared = np.isin(best.stretches(side), stretches).sum()
-            if shared <= rule.max_share * len(best.stretches(side)):
+            if shared <= max_share * len(best.stretches(side)):
                 continue
             if not _is_listed(vi_map, pair, side, T_alias):
                 third = other.missions[other.missions[0] == mission]

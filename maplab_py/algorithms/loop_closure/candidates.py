@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from maplab_py.algorithms.loop_closure.features import MapFeatures
+from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.array_types import I32, I64, Mask, Rows
 from maplab_py.distinct import distinct
 from maplab_py.memory import require_memory
@@ -21,6 +22,7 @@ from maplab_py.vimap import VIMap, ragged_rows, starts_of_counts
 
 _MIN_SHARED_LANDMARKS = 5
 """Number of common landmarks above which vertices belong to the same place."""
+_PLACES_PER_MISSION = 2
 _QUERIES_AT_ONCE = 1024
 _BYTES_PER_LANDMARK, _BYTES_PER_MATCH = 48, 77
 """Memory per listed landmark of a place and per match of a query [bytes]."""
@@ -49,19 +51,8 @@ class Candidates:
     match: I64  # rows of `Matches`, by candidate
 
 
-@dataclasses.dataclass(frozen=True)
-class CandidateRule:
-    """Criteria for places to be verified."""
-
-    min_time_ns: int
-    other_missions_only: bool
-    min_matches: int
-    places_per_mission: int = 2
-    fraction_best_scores: float = 0.25
-
-
 def find_candidates(
-    vi_map: VIMap, features: MapFeatures, matches: Matches, rule: CandidateRule
+    vi_map: VIMap, features: MapFeatures, matches: Matches, options: LoopClosureOptions
 ) -> Candidates:
     """Return the candidate places in every mission for each query vertex."""
     seen = _observers(vi_map)  # (L, V)
@@ -71,14 +62,14 @@ def find_candidates(
     places: list[I64] = [np.zeros((0, 3), dtype=np.int64)]
     for begin in range(0, len(queries), _QUERIES_AT_ONCE):
         chunk = queries[begin : begin + _QUERIES_AT_ONCE]
-        places.append(_best_places(vi_map, chunk, matched[chunk] @ seen, near, rule))
+        places.append(_best_places(vi_map, chunk, matched[chunk] @ seen, near, options))
     del matched
     picks = np.concatenate(places)
     picks = picks[np.lexsort((picks[:, 1], picks[:, 0]))]
     by_vertex = _MatchesByVertex.of(features, matches, len(vi_map.vertices))
     cuts = _cuts(picks, near, seen, by_vertex)
     parts = [
-        _with_matches(picks[begin:end], near, seen, by_vertex, rule)
+        _with_matches(picks[begin:end], near, seen, by_vertex, options)
         for begin, end in itertools.pairwise(cuts)
     ]
     return _joined(parts)
@@ -165,28 +156,32 @@ def _observers(vi_map: VIMap) -> Any:
     return seen
 
 
-def _best_places(vi_map: VIMap, queries: I64, votes: Any, near: Any, rule: CandidateRule) -> I64:
+def _best_places(
+    vi_map: VIMap, queries: I64, votes: Any, near: Any, options: LoopClosureOptions
+) -> I64:
     """Return rows [query vertex, place vertex, votes] of the best places per query and mission.
 
     Args:
         queries: Query vertices (Q,).
         votes: Votes (Q, V), sparse.
         near: Vertices (V, V) that belong to one place, sparse.
-        rule: Criteria.
+        options: Criteria.
     """
     v = vi_map.vertices
     entries = votes.tocoo()
     query, place = (np.asarray(axis, dtype=np.int64) for axis in entries.coords)
     value = entries.data.astype(np.int64)
     same = v.mission[queries[query]] == v.mission[place]
-    apart = np.abs(v.timestamp_ns[queries[query]] - v.timestamp_ns[place]) >= rule.min_time_ns
-    kept = (value >= rule.min_matches) & (~same | (apart & (not rule.other_missions_only)))
+    apart = np.abs(v.timestamp_ns[queries[query]] - v.timestamp_ns[place]) >= round(
+        options.min_image_time_seconds * 1e9
+    )
+    kept = (value >= options.min_verify_matches_num) & (~same | apart)
     query, place, value = query[kept], place[kept], value[kept]
     group = query * len(vi_map.missions) + v.mission[place]
     order = np.lexsort((place, -value, group))
     query, place, value, group = query[order], place[order], value[order], group[order]
     picks, floor = [], np.zeros(0)
-    for number in range(rule.places_per_mission):
+    for number in range(_PLACES_PER_MISSION):
         is_first = np.append(True, group[1:] != group[:-1])[: len(group)]
         first = np.flatnonzero(is_first)
         if len(first) == 0:
@@ -194,7 +189,7 @@ def _best_places(vi_map: VIMap, queries: I64, votes: Any, near: Any, rule: Candi
         of_group = np.cumsum(is_first) - 1
         if number == 0:
             floor = np.zeros(len(queries) * len(vi_map.missions))
-            floor[group[first]] = value[first] * rule.fraction_best_scores
+            floor[group[first]] = value[first] * options.fraction_best_scores
         good = first[value[first] >= floor[group[first]]]
         picks.append(np.stack([queries[query[good]], place[good], value[good]], axis=1))
         left = ~_contains(near, place[first][of_group], place)
@@ -212,7 +207,7 @@ def _contains(matrix: Any, row: I64, column: I64) -> Mask:
 
 
 def _with_matches(
-    picks: I64, near: Any, seen: Any, matches: _MatchesByVertex, rule: CandidateRule
+    picks: I64, near: Any, seen: Any, matches: _MatchesByVertex, options: LoopClosureOptions
 ) -> Candidates:
     """Return the matches of each query vertex with the landmarks of its place."""
     place = (near[picks[:, 1]] @ seen.T).tocsr()  # (P, L) landmarks of the place
@@ -227,7 +222,7 @@ def _with_matches(
     inside = np.append(entry, -1)[where] == wanted
     row, pick = matches.row[row[inside]], pick[inside]
     count = np.bincount(pick, minlength=len(picks))
-    enough = count >= rule.min_matches
+    enough = count >= options.min_verify_matches_num
     return Candidates(
         query_vertex=picks[enough, 0],
         place_vertex=picks[enough, 1],

@@ -25,16 +25,11 @@ _MOST_PAIRS = 1_000_000
 """Pairs of closures that are compared at once, for the memory."""
 
 
-@dataclasses.dataclass(frozen=True)
-class ConsensusRule:
-    """Criteria for the agreement of two closures and the required support."""
-
-    position_tolerance_m: float = 0.15
-    yaw_tolerance_rad: float = 0.025
-    drift_ratio: float = 0.02  # per arc length between the queries plus that between the places
-    yaw_drift_rad_per_m: float = 4e-4  # over the same way
-    lone_inliers: int = 50  # required inliers of a closure without neighbours
-    max_difference: float = 1.0  # factor on the tolerances
+_TOLERANCE_M, _TOLERANCE_RAD = 0.15, 0.025
+_DRIFT_RATIO, _DRIFT_RAD_PER_M = 0.02, 4e-4
+"""Drift per arc length between the queries plus that between the places."""
+_LONE_INLIERS = 50
+"""Required inliers of a closure without neighbours."""
 
 
 def path_lengths(vi_map: VIMap) -> F64:
@@ -53,12 +48,12 @@ def check_consensus(
     place_vertex: I64,
     T_M_I: F64,
     inliers: I64,
-    rule: ConsensusRule,
+    max_difference: float = 1.0,
 ) -> tuple[I64, F64]:
     """Return the query vertices (N,) that support closures, and the differences (N,) from neighbours.
 
-    A closure whose difference reaches `max_difference` is contradicted. Closures that need no support,
-    because they have many inliers and no neighbours, have not-a-number.
+    A closure whose difference reaches `max_difference`, a factor on the tolerances, is contradicted.
+    Closures that need no support, because they have many inliers and no neighbours, have not-a-number.
     """
     mission = vi_map.vertices.mission
     pair = mission[query_vertex].astype(np.int64) * len(vi_map.missions) + mission[place_vertex]
@@ -66,7 +61,7 @@ def check_consensus(
     order = np.lexsort((place_vertex, way[query_vertex], pair))
     T_A_I = vi_map.vertices.T_M_I[query_vertex]
     parts = [
-        _compare(i, j, pair, way, query_vertex, place_vertex, T_A_I, T_M_I, rule)
+        _compare(i, j, pair, way, query_vertex, place_vertex, T_A_I, T_M_I)
         for i, j in _neighbours(order)
     ]
     columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
@@ -75,9 +70,9 @@ def check_consensus(
     alive = np.ones(len(query_vertex), dtype=np.bool_)
     # a wrong closure may contradict correct ones: test twice, the second time with survivors only
     for _ in range(2):
-        support, difference, is_alone = compared.votes(inliers, alive, rule.max_difference)
-        alive = alive & ~(difference >= rule.max_difference) & (support > 0)
-    lone = is_alone & (inliers >= rule.lone_inliers)
+        support, difference, is_alone = compared.votes(inliers, alive, max_difference)
+        alive = alive & ~(difference >= max_difference) & (support > 0)
+    lone = is_alone & (inliers >= _LONE_INLIERS)
     return support, np.where(lone, np.nan, difference)
 
 
@@ -131,7 +126,6 @@ def _compare(
     place: I64,
     T_A_I: F64,
     T_B_I: F64,
-    rule: ConsensusRule,
 ) -> tuple[I64, I64, F64, Mask, Mask]:
     """Return the columns of `_Compared` for those of some pairs that are near each other."""
     between = np.abs(way[query[i]] - way[query[j]])
@@ -140,8 +134,8 @@ def _compare(
     E = yaw.from_pose(se3.compose(T_B_I, se3.inverse(T_A_I)))  # frame A in frame B
     between_places = np.abs(way[place[i]] - way[place[j]])
     both_ways = between + np.minimum(between_places, between + _REACH_M)
-    largest_m = rule.position_tolerance_m + rule.drift_ratio * both_ways
-    largest_rad = rule.yaw_tolerance_rad + rule.yaw_drift_rad_per_m * both_ways
+    largest_m = _TOLERANCE_M + _DRIFT_RATIO * both_ways
+    largest_rad = _TOLERANCE_RAD + _DRIFT_RAD_PER_M * both_ways
     # position of query i implied by closure j
     apart_m = np.linalg.norm(yaw.transform(E[j], T_A_I[i, 4:]) - T_B_I[i, 4:], axis=1)
     turn_rad = np.abs(yaw.wrap(E[i, 3] - E[j, 3]))

@@ -10,7 +10,6 @@ import numpy as np
 
 from maplab_py.algorithms.loop_closure import alignment_contest, closure_table, gates, matching
 from maplab_py.algorithms.loop_closure.candidates import (
-    CandidateRule,
     Candidates,
     Matches,
     find_candidates,
@@ -91,17 +90,7 @@ def detect(
         features, options, rule, only_other_missions, asked
     )
     progress.step(2, 4, "places")
-    candidates = find_candidates(
-        vi_map,
-        features,
-        matches,
-        CandidateRule(
-            min_time_ns=rule.min_time_ns,
-            other_missions_only=False,
-            min_matches=options.min_verify_matches_num,
-            fraction_best_scores=options.fraction_best_scores,
-        ),
-    )
+    candidates = find_candidates(vi_map, features, matches, options)
     progress.step(3, 4, "poses")
     search, notes = _search(vi_map, features, matches, candidates, options, progress)
     closures, contests = _closures(

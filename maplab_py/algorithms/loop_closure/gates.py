@@ -15,7 +15,7 @@ from maplab_py.algorithms.landmarks.keypoint_rays import largest_sigma
 from maplab_py.algorithms.loop_closure import alignment_contest, mission_alignment
 from maplab_py.algorithms.loop_closure.closure_record import ClosureRecord
 from maplab_py.algorithms.loop_closure.closure_table import VERDICTS, GateValues
-from maplab_py.algorithms.loop_closure.consensus import ConsensusRule, check_consensus, path_lengths
+from maplab_py.algorithms.loop_closure.consensus import check_consensus, path_lengths
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.record_updates import banned
 from maplab_py.algorithms.loop_closure.reports import Verdict
@@ -133,12 +133,15 @@ def measure(
     a, b = vi_map.vertices.mission[query], vi_map.vertices.mission[place]
     way_m = path_lengths(vi_map)
     change = se3.local(vi_map.T_G_I[query], se3.compose(vi_map.T_G_M[b], solutions.T_M_I))
+    known = np.flatnonzero(~np.isnan(solutions.covariance[:, 0, 0]))
+    sigma_deg = np.full(len(solutions.covariance), np.nan)
+    sigma_deg[known] = np.degrees(largest_sigma(solutions.covariance[known, 3:, 3:]))
     return GateValues(
         verdict=np.full(len(query), VERDICTS.index(Verdict.ACCEPTED), dtype=np.int8),
         matches=solutions.keypoint_count,
         inliers=solutions.inlier_count,
         tilt_deg=np.degrees(solutions.tilt_rad),
-        rotation_sigma_deg=_rotation_sigma_deg(solutions.covariance),
+        rotation_sigma_deg=sigma_deg,
         correction_m=np.linalg.norm(change[:, :3], axis=1),
         correction_deg=np.degrees(np.linalg.norm(change[:, 3:], axis=1)),
         is_related=np.asarray((a == b) | (is_known[a] & is_known[b])),
@@ -152,14 +155,6 @@ def _not_compared(count: int) -> dict[str, Any]:
     names = ("rival_share", "rival_stretches", "is_decided", "follows", "difference")
     unknown = {name: np.full(count, np.nan) for name in names}
     return {**unknown, "support": np.zeros(count, dtype=np.int64)}
-
-
-def _rotation_sigma_deg(covariance: F64) -> F64:
-    """Return the deviation (N,) about the worst axis, of covariances (N, 6, 6) of [dp, dtheta]."""
-    known = np.flatnonzero(~np.isnan(covariance[:, 0, 0]))
-    sigma_deg = np.full(len(covariance), np.nan)
-    sigma_deg[known] = np.degrees(largest_sigma(covariance[known, 3:, 3:]))
-    return sigma_deg
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -265,9 +260,13 @@ def judge(
     j.refuse_by(place_gates(v, options))
     rows = np.flatnonzero(v.accepted)
     if len(rows):
-        rule = ConsensusRule(max_difference=options.max_neighbour_difference)
         v.support[rows], v.difference[rows] = check_consensus(
-            vi_map, query[rows], place[rows], T_M_I[rows], v.inliers[rows], rule
+            vi_map,
+            query[rows],
+            place[rows],
+            T_M_I[rows],
+            v.inliers[rows],
+            options.max_neighbour_difference,
         )
         j.refuse_by(neighbour_gates(v, options))
     return v, contests
@@ -281,15 +280,13 @@ def _contests(
     Closures with far places of the query's mission show which places look alike. `geometric` (N,) are
     those that passed the gates on their poses.
     """
-    v, rule = j.values, alignment_contest.ContestRule(j.options.max_ambiguous_ratio)
+    v, max_share = j.values, j.options.max_ambiguous_ratio
     voting = v.accepted & ~v.is_related
     v.follows[voting] = 0.0
     is_alias = geometric & j.is_far & (v.inliers >= _MIN_RIVAL_INLIERS)
-    pairs = mission_alignment.alignments_of_pairs(
-        j.paired, voting | is_alias, mission_alignment.AgreementRule()
-    )
+    pairs = mission_alignment.alignments_of_pairs(j.paired, voting | is_alias)
     names = [to_hex(words)[:8] for words in j.vi_map.missions.id]
-    contests = alignment_contest.decide(j.vi_map, pairs, j.stretch, rule, names)
+    contests = alignment_contest.decide(j.vi_map, pairs, j.stretch, max_share, names)
     is_open = [contest.winner < 0 for contest in contests]
     if choice is not None:
         contests = alignment_contest.with_choice(contests, choice)
@@ -365,48 +362,40 @@ def _repeats(j: Judgement) -> Mask:
     candidate = j.values.accepted & (j.missions[0] == j.missions[1])
     unusual = candidate & ~j.is_usual
     if unusual.any():
-        rule = alignment_contest.ContestRule(j.options.max_ambiguous_ratio)
-        for pair in mission_alignment.alignments_of_pairs(
-            j.paired, candidate, mission_alignment.AgreementRule()
-        ):
-            for rival in _rivals(j.vi_map, pair, j.is_usual, j.stretch, rule):
+        for pair in mission_alignment.alignments_of_pairs(j.paired, candidate):
+            for rival in _rivals(j, pair):
                 refused[rival.rows] = True
     return np.asarray(refused & unusual)
 
 
-def _rivals(
-    vi_map: VIMap,
-    pair: mission_alignment.MissionPair,
-    is_usual: Mask,
-    stretch: I64,
-    rule: alignment_contest.ContestRule,
-) -> list[mission_alignment.Alignment]:
+def _rivals(j: Judgement, pair: mission_alignment.MissionPair) -> list[mission_alignment.Alignment]:
     """Return the groups of closures that lose against those of usual drift."""
-    usual = [a for a in pair.alignments if np.mean(is_usual[a.rows]) > 0.5]
+    usual = [a for a in pair.alignments if np.mean(j.is_usual[a.rows]) > 0.5]
     explained = np.unique(
         np.concatenate([np.zeros(0, dtype=np.int64), *(_stretches(a) for a in usual)])
     )
     if len(explained) < _MIN_STRETCHES:
         return []
-    unmatched = min(mission_alignment.unmatched_share(vi_map, pair, a, stretch) for a in usual)
-    others = [a for a in pair.alignments if np.mean(is_usual[a.rows]) <= 0.5]
+    unmatched = functools.partial(
+        mission_alignment.unmatched_share, j.vi_map, pair, stretch=j.stretch
+    )
+    least = min(map(unmatched, usual))
     return [
         a
-        for a in others
-        if _adds_little(_stretches(a), explained, rule)
-        or mission_alignment.is_refuted(
-            mission_alignment.unmatched_share(vi_map, pair, a, stretch), unmatched
+        for a in pair.alignments
+        if np.mean(j.is_usual[a.rows]) <= 0.5
+        and (
+            _adds_little(_stretches(a), explained)
+            or mission_alignment.is_refuted(unmatched(a), least)
         )
     ]
 
 
-def _adds_little(group: I64, explained: I64, rule: alignment_contest.ContestRule) -> bool:
+def _adds_little(group: I64, explained: I64) -> bool:
     """Return whether most stretches of a group, and significantly more others, are explained without it."""
     theirs = len(np.setdiff1d(group, explained))
     ours = len(np.setdiff1d(explained, group))
-    return alignment_contest.is_significant(ours, theirs, rule) and theirs <= _MAX_NEW_SHARE * len(
-        group
-    )
+    return alignment_contest.is_significant(ours, theirs) and theirs <= _MAX_NEW_SHARE * len(group)
 
 
 def _stretches(alignment: mission_alignment.Alignment) -> I64:

@@ -134,16 +134,12 @@ class _Search:
         near = (shared >= _MIN_SHARED_LANDMARKS).astype(np.int32) @ sees
         problem, landmark = near.tocsr().tocoo().coords
         problem, landmark = problem.astype(np.int64), landmark.astype(np.int64)
-        new = self._findable[landmark] & ~self._is_observed(c.query_vertex[rows][problem], landmark)
+        wanted = c.query_vertex[rows][problem] * self._sees.shape[1] + landmark
+        place = np.searchsorted(self._entries[:-1], wanted)
+        new = self._findable[landmark] & ~np.asarray(self._entries[place] == wanted)
         problem, landmark = problem[new], landmark[new]
         order = np.lexsort((landmark, problem))
         return problem[order], landmark[order]
-
-    def _is_observed(self, vertex: I64, landmark: I64) -> Mask:
-        """Return whether vertices (N,) observe landmarks (N,)."""
-        wanted = vertex * self._sees.shape[1] + landmark
-        place = np.searchsorted(self._entries[:-1], wanted)
-        return np.asarray(self._entries[place] == wanted)
 
     def _keypoints(self, vertices: I64) -> tuple[I64, I64]:
         """Return the keypoints (N,) of vertices that observe a landmark, and the vertices' index."""

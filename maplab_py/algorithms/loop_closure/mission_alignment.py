@@ -23,13 +23,9 @@ _MIN_STRETCHES = 2
 """Stretches of either mission that an alignment needs to be listed; fewer may be a single error."""
 
 
-@dataclasses.dataclass(frozen=True)
-class AgreementRule:
-    """Criteria for closures that support the same alignment."""
-
-    drift_offset_m: float = 0.5
-    drift_ratio: float = 0.02  # per arc length between the closures, in both missions
-    max_turn_rad: float = 0.3
+_DRIFT_OFFSET_M, _DRIFT_RATIO = 0.5, 0.02
+"""Drift, per arc length between closures in both missions, up to which they support the same alignment."""
+_MAX_TURN_RAD = 0.3
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -98,9 +94,7 @@ class MissionPair:
         return self.mission_A, self.mission_B
 
 
-def alignments_of_pairs(
-    closures: PairedClosures, candidate: Mask, rule: AgreementRule
-) -> list[MissionPair]:
+def alignments_of_pairs(closures: PairedClosures, candidate: Mask) -> list[MissionPair]:
     """Return the alignments of every pair of missions that candidates (N,) join."""
     rows = np.flatnonzero(candidate)
     key = closures.mission_A * (int(closures.mission_B.max(initial=0)) + 1) + closures.mission_B
@@ -110,13 +104,13 @@ def alignments_of_pairs(
     pairs = []
     for mine in np.split(rows, np.flatnonzero(np.diff(key[rows])) + 1):
         if len(mine):
-            alignments = _alignments(closures.take(mine), E[mine], mine, rule)
+            alignments = _alignments(closures.take(mine), E[mine], mine)
             ends = int(closures.mission_A[mine[0]]), int(closures.mission_B[mine[0]])
             pairs.append(MissionPair(*ends, mine, alignments))
     return pairs
 
 
-def _alignments(c: PairedClosures, E: F64, rows: I64, rule: AgreementRule) -> tuple[Alignment, ...]:
+def _alignments(c: PairedClosures, E: F64, rows: I64) -> tuple[Alignment, ...]:
     """Take the alignment with most support, remove its closures, and repeat; share them out at last."""
     from scipy.sparse import csr_array
 
@@ -129,7 +123,7 @@ def _alignments(c: PairedClosures, E: F64, rows: I64, rule: AgreementRule) -> tu
     while len(left) and len(hypotheses) < _MAX_ALIGNMENTS:
         pick = np.linspace(0, len(left) - 1, min(len(left), _MAX_HYPOTHESES)).astype(np.int64)
         tried = left[np.unique(pick)]
-        agree = _error(E, c, tried, left, rule) < 1.0
+        agree = _error(E, c, tried, left) < 1.0
         support = ((csr_array(agree.astype(np.int32)) @ sees[left]) > 0).sum(axis=1)
         best = int(np.lexsort((-(agree @ c.weight[left]), -support))[0])
         mine = left[agree[best]]
@@ -139,7 +133,7 @@ def _alignments(c: PairedClosures, E: F64, rows: I64, rule: AgreementRule) -> tu
         hypotheses.append(int(tried[best]))
         left = left[~agree[best]]
     # drift allows for several alignments far from where they were found: the nearest is meant
-    error = _error(E, c, np.array(hypotheses, dtype=np.int64), np.arange(len(rows)), rule)
+    error = _error(E, c, np.array(hypotheses, dtype=np.int64), np.arange(len(rows)))
     nearest = np.argmin(error, axis=0) if hypotheses else np.zeros(len(rows), dtype=np.int64)
     alignments = []
     for number, hypothesis in enumerate(hypotheses):
@@ -149,15 +143,15 @@ def _alignments(c: PairedClosures, E: F64, rows: I64, rule: AgreementRule) -> tu
     return tuple(sorted(alignments, key=lambda alignment: -alignment.support))
 
 
-def _error(E: F64, c: PairedClosures, hypothesis: I64, rows: I64, rule: AgreementRule) -> F64:
+def _error(E: F64, c: PairedClosures, hypothesis: I64, rows: I64) -> F64:
     """Return the errors (H, L) of closures under hypotheses; below 1 they agree."""
     h = hypothesis[:, None]
     p_B = yaw.transform(E[h], c.T_A_I[None, rows, 4:])
     apart = np.linalg.norm(p_B - c.T_B_I[None, rows, 4:], axis=2)
     between = np.abs(c.way_A_m[rows] - c.way_A_m[h]) + np.abs(c.way_B_m[rows] - c.way_B_m[h])
     turn = np.abs(yaw.wrap(E[h, 3] - E[None, rows, 3]))
-    of_position = apart / (rule.drift_offset_m + rule.drift_ratio * between)
-    error = np.maximum(of_position, turn / rule.max_turn_rad)
+    of_position = apart / (_DRIFT_OFFSET_M + _DRIFT_RATIO * between)
+    error = np.maximum(of_position, turn / _MAX_TURN_RAD)
     return np.asarray(np.where(np.isnan(error), np.inf, error))
 
 

@@ -13,7 +13,7 @@ from maplab_py.algorithms.loop_closure.closure_table import (
     GateValues,
     closure_edges,
 )
-from maplab_py.algorithms.loop_closure.consensus import ConsensusRule, check_consensus
+from maplab_py.algorithms.loop_closure.consensus import check_consensus
 from maplab_py.algorithms.loop_closure.gates import judge, measure, rival_shares
 from maplab_py.algorithms.loop_closure.merging import Votes, count_pairs
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
@@ -93,7 +93,7 @@ def consensus(query: list[int], place: list[int], off_m: list[float], inliers: l
     vi_map = two_laps()
     T_M_I = solutions(vi_map, np.array(query), off_m=np.array(off_m)).T_M_I
     support, difference = check_consensus(
-        vi_map, np.array(query), np.array(place), T_M_I, np.array(inliers), ConsensusRule()
+        vi_map, np.array(query), np.array(place), T_M_I, np.array(inliers)
     )
     return support, (support >= 2) | np.isnan(difference), difference >= 1.0
 

@@ -10,7 +10,6 @@ from maplab_py.algorithms.loop_closure import candidates, detection, matching
 from maplab_py.algorithms.loop_closure import features as features_module
 from maplab_py.algorithms.loop_closure.alignment_contest import (
     AlignmentChoice,
-    ContestRule,
     decide,
     listed_alignments,
     with_choice,
@@ -18,7 +17,6 @@ from maplab_py.algorithms.loop_closure.alignment_contest import (
 from maplab_py.algorithms.loop_closure.features import map_features
 from maplab_py.algorithms.loop_closure.matching import SearchMemory, match_features
 from maplab_py.algorithms.loop_closure.mission_alignment import (
-    AgreementRule,
     PairedClosures,
     alignments_of_pairs,
 )
@@ -32,8 +30,7 @@ from maplab_py.vision.index import MatchRule
 from tests.algorithms.anchoring.test_anchoring import scrambled
 from tests.algorithms.loop_closure.rooms import Walk, make_map
 
-RULE = AgreementRule()
-CONTEST = ContestRule(max_share=0.1)
+MAX_SHARE = 0.1
 LENGTH_M = 60.0
 HERE, THERE = [1.0, 2.0, 0.0, 0.4], [21.0, 2.0, 0.0, 0.4]  # 20 m apart in frame B
 
@@ -89,9 +86,9 @@ def join(*parts: PairedClosures) -> PairedClosures:
 
 def contests(c: PairedClosures, missions: int = 2):
     vi_map = lines(missions)
-    pairs = alignments_of_pairs(c, np.ones(len(c.weight), dtype=bool), RULE)
+    pairs = alignments_of_pairs(c, np.ones(len(c.weight), dtype=bool))
     stretch = np.concatenate([100 * m + np.arange(60) for m in range(missions)])
-    return decide(vi_map, pairs, stretch, CONTEST, [f"m{i}" for i in range(missions)])
+    return decide(vi_map, pairs, stretch, MAX_SHARE, [f"m{i}" for i in range(missions)])
 
 
 def metres(begin: float, end: float) -> np.ndarray:
