@@ -10,11 +10,15 @@ from operator import attrgetter
 from typing import Any
 
 import numba
-from numba.core import cgutils, ir
+import numba.extending
+from numba.core import cgutils, event, ir
 from numba.core.codegen import CPUCodeLibrary, JITCodeLibrary, JITCPUCodegen
 from numba.core.environment import lookup_environment
 from numba.core.lowering import Lower
+from numba.core.postproc import PostProcessor, VariableLifetime
 from numba.core.targetconfig import ConfigStack
+from numba.core.transforms import canonicalize_cfg
+from numba.np import arrayobj
 from numba.np.arrayobj import fix_integer_index, load_item, store_item
 
 types: Any = numba.types
@@ -22,10 +26,49 @@ types: Any = numba.types
 
 def change_compiler() -> None:
     """Make all changes of this module."""
+    _leave_out_what_nobody_reads()
     _remember_types()
     _make_code_when_needed()
     _borrow_arguments()
     _index_directly()
+
+
+def _leave_out_what_nobody_reads() -> None:
+    """Leave out events, lives of variables before references are counted, and the shapes in an error's text.
+
+    They are a third of the time: functions that print numbers are compiled for each assignment to a part
+    of an array.
+    """
+    run = PostProcessor.run
+
+    def post_process(self: Any, emit_dels: bool = False, extend_lifetimes: bool = False) -> None:
+        function = self.func_ir
+        if emit_dels or function.is_generator:
+            run(self, emit_dels, extend_lifetimes)
+            return
+        function.blocks = canonicalize_cfg(function.blocks)
+        function.variable_lifetime = VariableLifetime(function.blocks)
+        function.generator_info = None
+
+    def variables(_: Any, value: Any) -> list[Any]:
+        found, rest = [], [value]
+        while rest:
+            each = rest.pop()
+            if isinstance(each, ir.Var):
+                found.append(each)
+            elif isinstance(each, ir.Inst):
+                found += each.list_vars()
+            elif isinstance(each, list | tuple | dict):
+                rest += reversed(each.values() if isinstance(each, dict) else each)
+        return found
+
+    def raise_error(source: Any, target: Any) -> None:
+        """Stand for the function that raises the error in kernels."""
+
+    PostProcessor.run, ir.Inst._rec_list_vars = post_process, variables
+    event.start_event = event.end_event = lambda *_, **__: None
+    numba.extending.overload(raise_error)(arrayobj.ol_raise_with_shape_context_generic)
+    arrayobj.raise_with_shape_context = raise_error
 
 
 def _remember_types() -> None:
