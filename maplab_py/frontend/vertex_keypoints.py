@@ -18,7 +18,7 @@ _MOST_WAITING = 16
 
 
 class VertexKeypoints:
-    """Describes the keypoints of vertices; a network does so in a thread beside the odometry."""
+    """Describes the keypoints of vertices in a thread beside the odometry."""
 
     def __init__(self, features: str, every: int) -> None:
         """Begin without vertices.
@@ -32,25 +32,25 @@ class VertexKeypoints:
         """
         check_descriptors_exist(features)
         self._features, self._every, self._count = features, every, 0
-        self._thread: ThreadPoolExecutor | None = None
+        self._thread = ThreadPoolExecutor(1, "maplab-vertices")
         self._waiting: collections.deque[Future[tuple[TrackedFrame, ...]]] = collections.deque()
 
     def of(self, update: odometry_update.OdometryUpdate) -> recorded_mission.VertexFrames:
         """Return the keypoints of a frame that becomes a vertex; those of a replay as they are."""
         if update.tracks is not None:
             return update.tracks.frames
-        given = update.tracked, update.images, update.time_ns
         is_turn, self._count = self._count % self._every == 0, self._count + 1
-        if self._features not in options.NETWORKS:
-            return described_frames(*given, self._features)
-        if not is_turn:
-            return described_frames(*given, _BETWEEN)
-        self._thread = self._thread or ThreadPoolExecutor(1, "maplab-vertices")
+        features = self._features
+        if features in options.NETWORKS and not is_turn:
+            features = _BETWEEN
         if len(self._waiting) == _MOST_WAITING:
             self._waiting.popleft().result()
-        future = self._thread.submit(described_frames, *given, self._features)
-        self._waiting.append(future)
-        return future
+        self._waiting.append(
+            self._thread.submit(
+                described_frames, update.tracked, update.images, update.time_ns, features
+            )
+        )
+        return self._waiting[-1]
 
 
 def described_frames(

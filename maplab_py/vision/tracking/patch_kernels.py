@@ -11,6 +11,8 @@ from maplab_py.compilation import compiled, prange
 HALF_PX = 7
 """Half the side of a patch; one more pixel on each side serves for gradients."""
 SIDE_PX = 2 * HALF_PX + 3
+_COUNT = (2 * HALF_PX + 1) ** 2
+_LANES = 2 * HALF_PX + 2
 _PARAMETERS = 6
 _GREY_SIGMA = 4.0
 _WARP_SIGMA = 0.02
@@ -55,8 +57,10 @@ def _sample_patch(image, centre_u, centre_v, patch):  # type: ignore[no-untyped-
 def _bilinear(image, u, v):  # type: ignore[no-untyped-def]
     """Return the grey value at a place inside the image."""
     # numbers without sign: those with one might count from the end of an array, which takes time to check
-    column, row, following = np.uint64(u), np.uint64(v), np.uint64(1)
-    a, b = np.float32(u - column), np.float32(v - row)
+    # (converted by way of numbers with one, for which processors have an instruction)
+    left, top, following = np.int64(u), np.int64(v), np.uint64(1)
+    column, row = np.uint64(left), np.uint64(top)
+    a, b = np.float32(u - left), np.float32(v - top)
     above = (_UNITY - a) * np.float32(image[row, column])
     above += a * np.float32(image[row, column + following])
     row += following
@@ -79,16 +83,20 @@ def align_patches(image, uv, patch, warp, is_shown):  # type: ignore[no-untyped-
         warp: Expected change (K, 2, 2) from offsets in the patch to offsets in the image; changed.
         is_shown: Filled in (K,): the image shows the patch.
     """
-    side = 2 * HALF_PX + 1
     for block in prange(-(-len(uv) // _BLOCK)):
-        slope = np.empty((_PARAMETERS, side * side), dtype=np.float32)
-        template = np.empty(side * side, dtype=np.float32)
-        sampled = np.empty(side * side, dtype=np.float32)
+        slope = np.empty((_PARAMETERS, _COUNT), dtype=np.float32)
+        template = np.empty(_COUNT, dtype=np.float32)
+        sampled = np.empty(_COUNT + 1, dtype=np.float32)
+        corners = (
+            np.empty(_LANES, dtype=np.int32),
+            np.empty((4, _LANES), dtype=np.int32),
+            np.empty((2, _LANES), dtype=np.float32),
+        )
         square, right = np.empty((_PARAMETERS, _PARAMETERS)), np.empty(_PARAMETERS)
         for k in range(block * _BLOCK, min((block + 1) * _BLOCK, len(uv))):
             u, v = uv[k, 0], uv[k, 1]
             similarity = _align(
-                image, patch[k], uv[k], warp[k], slope, template, sampled, square, right
+                image, patch[k], uv[k], warp[k], slope, template, sampled, corners, square, right
             )
             step_px = np.sqrt((uv[k, 0] - u) ** 2 + (uv[k, 1] - v) ** 2)
             least, largest = _stretch(warp[k])
@@ -112,14 +120,14 @@ def _stretch(warp):  # type: ignore[no-untyped-def]
 
 
 @compiled(**_FAST)
-def _align(image, patch, uv, warp, slope, template, sampled, square, right):  # type: ignore[no-untyped-def]
+def _align(image, patch, uv, warp, slope, template, sampled, corners, square, right):  # type: ignore[no-untyped-def]
     """Align one patch; see `align_patches`."""
     contrast = _prepare(patch, slope, template, square)
     if not contrast > 0.0:
         return -1.0
     _factorise(square)
     for _ in range(_ITERATIONS):
-        if not _sample(image, uv, warp, contrast, sampled):
+        if not _sample(image, uv, warp, contrast, sampled, corners):
             return -1.0
         for i in range(_PARAMETERS):
             # slopes are orthogonal to the template
@@ -188,7 +196,7 @@ def _prepare(patch, slope, template, square):  # type: ignore[no-untyped-def]
 
 
 @compiled(**_FAST)
-def _sample(image, uv, warp, contrast, sampled):  # type: ignore[no-untyped-def]
+def _sample(image, uv, warp, contrast, sampled, corners):  # type: ignore[no-untyped-def]
     """Fill in grey values under a warp, of mean 0 and a contrast; return whether they are in the image."""
     height, width = image.shape
     reach_u = HALF_PX * (abs(warp[0, 0]) + abs(warp[0, 1]))
@@ -198,27 +206,51 @@ def _sample(image, uv, warp, contrast, sampled):  # type: ignore[no-untyped-def]
     if not inside:
         return False
     total = _ZERO
-    n = 0
-    for row in range(-HALF_PX, HALF_PX + 1):
-        u = uv[0] - HALF_PX * warp[0, 0] + warp[0, 1] * row
-        v = uv[1] - HALF_PX * warp[1, 0] + warp[1, 1] * row
-        for _ in range(2 * HALF_PX + 1):
-            sampled[n] = _bilinear(image, u, v)
-            total += sampled[n]
-            u += warp[0, 0]
-            v += warp[1, 0]
-            n += 1
-    mean = total / np.float32(n)
+    for row in range(2 * HALF_PX + 1):
+        first = row * (2 * HALF_PX + 1)
+        u = uv[0] - HALF_PX * warp[0, 0] + warp[0, 1] * (row - HALF_PX)
+        v = uv[1] - HALF_PX * warp[1, 0] + warp[1, 1] * (row - HALF_PX)
+        _sample_line(image, u, v, (warp[0, 0], warp[1, 0]), first, sampled, corners)
+    for n in range(_COUNT):
+        total += sampled[n]
+    mean = total / np.float32(_COUNT)
     squares = _ZERO
-    for n in range(len(sampled)):
+    for n in range(_COUNT):
         sampled[n] -= mean
         squares += sampled[n] * sampled[n]
     if squares < _UNITY:
         return False
     scale = contrast / np.sqrt(squares)
-    for n in range(len(sampled)):
+    for n in range(_COUNT):
         sampled[n] *= scale
     return True
+
+
+@compiled(forceinline=True, **_FAST)
+def _sample_line(image, u, v, step, first, sampled, corners):  # type: ignore[no-untyped-def]
+    """Fill in grey values of places in a line, and a last one that is not used.
+
+    Places, loads and sums are loops of their own: whole vectors are computed in the first and the last.
+    """
+    place, grey, share = corners
+    width, flat = np.int32(image.shape[1]), image.ravel()
+    for lane in range(_LANES):
+        along = min(lane, 2 * HALF_PX)
+        x, y = u + along * step[0], v + along * step[1]
+        column, row = np.int32(x), np.int32(y)
+        place[lane] = row * width + column
+        share[0, lane], share[1, lane] = np.float32(x - column), np.float32(y - row)
+    following, below = np.uint64(1), np.uint64(width)
+    for lane in range(_LANES):
+        k = np.uint64(place[lane])
+        grey[0, lane], grey[1, lane] = flat[k], flat[k + following]
+        k += below
+        grey[2, lane], grey[3, lane] = flat[k], flat[k + following]
+    for lane in range(_LANES):
+        a, b = share[0, lane], share[1, lane]
+        above = (_UNITY - a) * np.float32(grey[0, lane]) + a * np.float32(grey[1, lane])
+        below = (_UNITY - a) * np.float32(grey[2, lane]) + a * np.float32(grey[3, lane])
+        sampled[first + lane] = (_UNITY - b) * above + b * below
 
 
 @compiled(**_FAST)

@@ -160,12 +160,10 @@ def test_a_thread_describes_every_third_vertex(
     )
     keypoints = VertexKeypoints("xfeat", 3)
     frames = [keypoints.of(update) for _ in range(60)]
-    assert [isinstance(each, Future) for each in frames] == [True, False, False] * 20
-    (learned,), (binary,) = (
-        each.result() if isinstance(each, Future) else each for each in frames[-3:-1]
-    )
-    assert learned is not None
-    assert binary is not None
-    assert (learned.feature_type, binary.feature_type) == (FeatureType.XFEAT, FeatureType.BINARY)
+    assert all(isinstance(each, Future) for each in frames)
+    described = [each.result()[0] for each in frames if isinstance(each, Future)]
+    expected = [FeatureType.XFEAT, FeatureType.BINARY, FeatureType.BINARY] * 20
+    assert [frame.feature_type for frame in described] == expected
+    learned, binary = described[-3:-1]
     assert np.array_equal(learned.descriptor.view("<f4"), network.describe(image, uv_px))
     assert np.array_equal(learned.track_id, binary.track_id)
