@@ -191,12 +191,10 @@ def known_share(sigma: F64, prior_sigma: F64, tolerance: F64) -> float:
     return float(np.clip(share, 0.0, 1.0).mean())
 
 
-def least_known(
-    covariance: F64, parameters: Parameters, tolerance: F64, count: int = 3
-) -> tuple[str, ...]:
-    """Return the parameters of the directions whose deviation exceeds the wanted one most."""
+def least_known(covariance: F64, parameters: Parameters, tolerance: F64) -> tuple[str, ...]:
+    """Return the parameters of the three directions whose deviation exceeds the wanted one most."""
     _, directions = np.linalg.eigh(covariance / np.outer(tolerance, tolerance))
-    return tuple(dict.fromkeys(name_directions(directions[:, : -count - 1 : -1], parameters)))
+    return tuple(dict.fromkeys(name_directions(directions[:, :-4:-1], parameters)))
 
 
 def suggestions(

@@ -238,11 +238,6 @@ def _rays(device: Device, recording: Recording) -> tuple[F64, F64]:
 
 
 _SWITCH_VARIANCE = 1e-3
-_SENSOR_NAMES = {
-    tables.MissionSensor.ABSOLUTE_6DOF: "ABSOLUTE_6DOF",
-    tables.MissionSensor.ODOMETRY_6DOF: "ODOMETRY_6DOF",
-    tables.MissionSensor.WHEEL_ODOMETRY: "WHEEL_ODOMETRY",
-}
 
 
 def add_other_sensors(
@@ -271,7 +266,7 @@ def add_other_sensors(
     edges = []
     for kind in (tables.MissionSensor.ABSOLUTE_6DOF, tables.MissionSensor.ODOMETRY_6DOF):
         if wanted[kind]:
-            vi_map = _with_sensor(vi_map, kind, ids[kind], imu_id, T_I_S)
+            vi_map = with_sensor(vi_map, kind, ids[kind], imu_id, T_I_S)
     if wanted[tables.MissionSensor.ABSOLUTE_6DOF]:
         poses = _absolute_poses(
             T_G_I, T_I_S, time_ns, ids[tables.MissionSensor.ABSOLUTE_6DOF], options, rng
@@ -283,7 +278,7 @@ def add_other_sensors(
     if wanted[tables.MissionSensor.WHEEL_ODOMETRY]:
         kind, sensor = tables.MissionSensor.WHEEL_ODOMETRY, ids[tables.MissionSensor.WHEEL_ODOMETRY]
         T_I_W = wheel_mounting(options)
-        vi_map = _with_sensor(vi_map, kind, sensor, imu_id, T_I_W)
+        vi_map = with_sensor(vi_map, kind, sensor, imu_id, T_I_W)
         wheel = TransformationKind.WHEEL_ODOMETRY
         edges.append(_odometry(T_G_I, T_I_W, sensor, wheel, options, rng))
     if edges:
@@ -294,11 +289,11 @@ def add_other_sensors(
     return vi_map.replace(loop_closure_edges=loops), is_true
 
 
-def _with_sensor(
+def with_sensor(
     vi_map: VIMap, kind: tables.MissionSensor, words: U64, imu_id: str, T_I_S: F64
 ) -> VIMap:
     """Add a sensor to the map's sensors and its mission."""
-    sensor_id, name = to_hex(words), _SENSOR_NAMES[kind]
+    sensor_id, name = to_hex(words), kind.name
     keys = {"id": sensor_id, "sensor_type": name, "topic": name.lower()}
     sensors = SensorSet(
         {**vi_map.sensors.sensors, sensor_id: OtherSensor(sensor_id, name, keys)},

@@ -10,7 +10,6 @@ from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.ply import PlyCloud, encode_ply
 from maplab_py.progress import SILENT, Progress
-from maplab_py.sensors import Extrinsics, OtherSensor, SensorSet
 from maplab_py.simulation.changes import visible_in_light, with_changes
 from maplab_py.simulation.ray_caster import RayCaster, painted_boxes
 from maplab_py.simulation.recording import Recording, SessionSeeds, record
@@ -22,11 +21,11 @@ from maplab_py.simulation.scene import (
     make_session_appearance,
 )
 from maplab_py.simulation.sensors import Device, make_device
-from maplab_py.simulation.session import session_map
+from maplab_py.simulation.session import session_map, with_sensor
 from maplab_py.simulation.truth import Truth
 from maplab_py.simulation.world import World, make_world
 from maplab_py.storage.resources.new import NewResources
-from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap, from_hex, random_ids, to_hex
+from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap, random_ids
 
 _WORLD, _MOTION, _MEASUREMENT, _APPEARANCE, _IDS, _OTHER, _LIDAR, _CHANGES, _LIGHT = range(9)
 """Streams of random numbers; a session's number selects within a stream."""
@@ -230,7 +229,7 @@ def with_lidar_clouds(
     new = NewResources(seed=vi_map.missions.id[0].tobytes())
     for pose in T_G_L:
         new.add(CLOUDS_WITH_INTENSITY, b"".join(encode_ply(lidar.scan(pose, rng))))
-    mounted = _with_sensor(vi_map, to_hex(words), imu_id, T_I_L)
+    mounted = with_sensor(vi_map, MissionSensor.LIDAR, words, imu_id, T_I_L)
     if not len(new):
         return mounted
     return new.attached(
@@ -241,16 +240,3 @@ def with_lidar_clouds(
         sensor_id=words,
         timestamp_ns=time_ns,
     )
-
-
-def _with_sensor(vi_map: VIMap, sensor_id: str, imu_id: str, T_I_L: F64) -> VIMap:
-    """Add the lidar to the map's sensors and its mission."""
-    keys = {"id": sensor_id, "sensor_type": "LIDAR", "topic": "lidar"}
-    sensors = SensorSet(
-        {**vi_map.sensors.sensors, sensor_id: OtherSensor(sensor_id, "LIDAR", keys)},
-        {**vi_map.sensors.extrinsics, sensor_id: Extrinsics(imu_id, T_I_L)},
-        vi_map.sensors.extra,
-    )
-    ids = np.array(vi_map.missions.sensor_id)
-    ids[:, MissionSensor.LIDAR] = from_hex(sensor_id)
-    return vi_map.replace(sensors=sensors, missions=vi_map.missions.replace(sensor_id=ids))

@@ -106,13 +106,8 @@ def _mixed(ids: IdArray) -> NDArray[np.uint64]:
     return np.asarray((mixed ^ (mixed >> np.uint64(32))) * np.uint64(0xD6E8FEB86659FD93))
 
 
-def distinct_prefixes(ids: list[str], least: int = 4) -> list[str]:
-    """Return the shortest prefixes of hexadecimal ids that no other of the ids begins with.
-
-    Args:
-        ids: Distinct ids.
-        least: Least number of digits.
-    """
+def distinct_prefixes(ids: list[str]) -> list[str]:
+    """Return the shortest prefixes, of four or more digits, of ids that no other id begins with."""
     ordered = sorted(ids)
     shared: dict[str, int] = dict.fromkeys(ids, 0)
     for first, second in pairwise(ordered):
@@ -120,4 +115,4 @@ def distinct_prefixes(ids: list[str], least: int = 4) -> list[str]:
         common = next((place for place, differ in enumerate(differs) if differ), len(first))
         shared[first] = max(shared[first], common)
         shared[second] = max(shared[second], common)
-    return [id_[: max(least, shared[id_] + 1)] for id_ in ids]
+    return [id_[: max(4, shared[id_] + 1)] for id_ in ids]

@@ -94,8 +94,8 @@ def coobservation_counts(vi_map: VIMap) -> I64:
     return np.array(counts, dtype=np.int64).reshape(missions, missions)
 
 
-def mission_clusters(vi_map: VIMap, *, with_loop_closures: bool = True) -> I64:
-    """Label missions (M,) that shared landmarks or loop closure edges connect.
+def mission_clusters(vi_map: VIMap) -> I64:
+    """Label missions (M,) that shared landmarks connect.
 
     A landmark binds its store vertex' mission to those of its observers. Labels are the lowest
     mission row of each cluster.
@@ -104,10 +104,6 @@ def mission_clusters(vi_map: VIMap, *, with_loop_closures: bool = True) -> I64:
     keypoints = vi_map.observations
     home = mission[vi_map.landmarks.vertex[vi_map.keypoints.landmark[keypoints]]]
     pairs = np.stack([home, mission[vi_map.keypoint_vertex[keypoints]]], axis=1)
-    if with_loop_closures:
-        edges = vi_map.loop_closure_edges
-        ends = np.stack([mission[edges.from_vertex], mission[edges.to_vertex]], axis=1)
-        pairs = np.concatenate([pairs, ends])
     label = np.arange(len(vi_map.missions))
     pairs = np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
     while len(pairs):

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from maplab_py.array_types import NDArray
 from maplab_py.distinct import distinct
 from maplab_py.report import Report, counted
 from maplab_py.vimap import queries
@@ -195,15 +196,12 @@ def map_statistics(vi_map: VIMap) -> MapStatistics:
     )
     total = None
     if len(missions) > 1:
-        quality = np.bincount(vi_map.landmarks.quality, minlength=3)
         total = MapTotals(
             missions=len(missions),
             vertices=len(vi_map.vertices),
             edges=len(vi_map.imu_edges) + len(vi_map.transformation_edges),
             loop_closure_edges=len(vi_map.loop_closure_edges),
-            landmarks_good=int(quality[LandmarkQuality.GOOD]),
-            landmarks_bad=int(quality[LandmarkQuality.BAD]),
-            landmarks_unknown=int(quality[LandmarkQuality.UNKNOWN]),
+            **_by_quality(vi_map.landmarks.quality),
             keypoints=len(vi_map.keypoints),
             observations=len(vi_map.observations),
             distance_m=float(distances.sum()),
@@ -216,7 +214,7 @@ def map_statistics(vi_map: VIMap) -> MapStatistics:
 def coobservability(vi_map: VIMap) -> CoobservabilityReport:
     """Group missions that observe common landmarks."""
     names = to_hex_list(vi_map.missions.id)
-    label = queries.mission_clusters(vi_map, with_loop_closures=False)
+    label = queries.mission_clusters(vi_map)
     clusters = tuple(
         tuple(names[row] for row in np.flatnonzero(label == value)) for value in np.unique(label)
     )
@@ -229,7 +227,6 @@ def _mission(
 ) -> MissionStatistics:
     of_vertex = vi_map.vertices.mission == row
     stored = of_vertex[vi_map.landmarks.vertex]
-    quality = np.bincount(vi_map.landmarks.quality[stored], minlength=3)
     imu, loops = vi_map.imu_edges, vi_map.loop_closure_edges
     of_imu = of_vertex[imu.from_vertex]
     cameras = _cameras(vi_map, row)
@@ -249,9 +246,7 @@ def _mission(
         ),
         absolute_poses=int(np.count_nonzero(of_vertex[vi_map.absolute_poses.vertex])),
         imu_samples=int(imu.sample_count[of_imu].sum()),
-        landmarks_good=int(quality[LandmarkQuality.GOOD]),
-        landmarks_bad=int(quality[LandmarkQuality.BAD]),
-        landmarks_unknown=int(quality[LandmarkQuality.UNKNOWN]),
+        **_by_quality(vi_map.landmarks.quality[stored]),
         observations=sum(camera.observations for camera in cameras),
         cameras=cameras,
         distance_m=distance_m,
@@ -261,6 +256,12 @@ def _mission(
         resources=int(np.count_nonzero(owned)),
         name=str(vi_map.missions.name[row]),
     )
+
+
+def _by_quality(quality: NDArray[np.int8]) -> dict[str, int]:
+    """Return the fields with the numbers of landmarks of each quality."""
+    counts = np.bincount(quality, minlength=len(LandmarkQuality))
+    return {f"landmarks_{kind.name.lower()}": int(counts[kind]) for kind in LandmarkQuality}
 
 
 def _edge_counts(vi_map: VIMap, row: int) -> dict[str, int]:
@@ -283,16 +284,13 @@ def _cameras(vi_map: VIMap, row: int) -> tuple[CameraStatistics, ...]:
         chosen = of_mission & (index == camera)
         landmark = vi_map.keypoints.landmark[chosen[vi_map.keypoint_frame]]
         observing = landmark[landmark >= 0]
-        quality = np.bincount(vi_map.landmarks.quality[distinct(observing)], minlength=3)
         cameras.append(
             CameraStatistics(
                 camera_index=camera,
                 frames=int(np.count_nonzero(chosen)),
                 keypoints=len(landmark),
                 observations=len(observing),
-                landmarks_good=int(quality[LandmarkQuality.GOOD]),
-                landmarks_bad=int(quality[LandmarkQuality.BAD]),
-                landmarks_unknown=int(quality[LandmarkQuality.UNKNOWN]),
+                **_by_quality(vi_map.landmarks.quality[distinct(observing)]),
             )
         )
     return tuple(cameras)

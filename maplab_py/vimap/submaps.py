@@ -52,7 +52,7 @@ def append_submap(base: VIMap, submap: VIMap) -> tuple[VIMap, AppendReport]:
         )
     submap, shift_m, yaw_rad = _aligned(base, submap)
     stacked = merge.stack(base, submap)
-    vertex = _row_in_base(base.vertices.id, submap.vertices.id, unite=True)
+    vertex = _row_in_base(base.vertices.id, submap.vertices.id)
     missing = np.setdiff1d(
         submap.vertices.mission,
         submap.vertices.mission[vertex[len(base.vertices) :] < len(base.vertices)],
@@ -62,7 +62,7 @@ def append_submap(base: VIMap, submap: VIMap) -> tuple[VIMap, AppendReport]:
     stacked, united_observations, from_rows, into_rows = _unite_vertices(
         stacked, base, mission_of, vertex
     )
-    landmark = _row_in_base(base.landmarks.id, submap.landmarks.id, unite=True)
+    landmark = _row_in_base(base.landmarks.id, submap.landmarks.id)
     equal = np.flatnonzero(landmark != np.arange(len(landmark)))
     joined, collisions = _unite_landmarks(stacked, equal, landmark[equal], from_rows, into_rows)
     _check_connected(base, submap, joined)
@@ -91,11 +91,11 @@ def _matching_missions(base: VIMap, submap: VIMap) -> I64:
     return rows
 
 
-def _row_in_base(base_ids: IdArray, other_ids: IdArray, *, unite: bool) -> I64:
+def _row_in_base(base_ids: IdArray, other_ids: IdArray) -> I64:
     """Return the base row (B + O,) of each stacked row, or its row in the stack where the id is new."""
     rows = np.arange(len(base_ids) + len(other_ids))
     base_rows = IdIndex(base_ids).rows(other_ids)
-    known = (base_rows >= 0) & is_valid(other_ids) & unite
+    known = (base_rows >= 0) & is_valid(other_ids)
     rows[len(base_ids) :][known] = base_rows[known]
     return rows
 

@@ -84,8 +84,6 @@ def learn_projection(
     *,
     kind: DescriptorKind | None = None,
     dimensions: int = DIMENSIONS,
-    min_track_length: int = MIN_TRACK_LENGTH,
-    max_samples: int = MAX_TRAINING_SAMPLES,
 ) -> DescriptorProjection:
     """Learn the projection from descriptors whose tracks are known. Deterministic.
 
@@ -94,13 +92,11 @@ def learn_projection(
         track: Label (N,) of the track or landmark that each belongs to, negative for none.
         kind: What the descriptors are; None = binary.
         dimensions: Dimensions to keep.
-        min_track_length: Shortest track to learn from; halved down to 2 while there are too few.
-        max_samples: Learn from about as many descriptors, taken as whole tracks spread evenly.
 
     Raises:
         EstimationError: Too few tracks.
     """
-    rows = _training_rows(track, min_track_length, max_samples)
+    rows = _training_rows(track)
     if len(rows) == 0:
         raise EstimationError(
             f"the descriptor projection cannot be learned: fewer than {_MIN_TRAINING_TRACKS} tracks "
@@ -139,11 +135,12 @@ def _likelihood_ratio_metric(within: F64, overall: F64, dimensions: int, floor: 
     return np.ascontiguousarray(A, dtype=np.float32)
 
 
-def _training_rows(track: I64, min_length: int, max_samples: int) -> I64:
+def _training_rows(track: I64) -> I64:
     """Return rows of long enough tracks, track by track; empty when there are too few tracks."""
     order = np.argsort(track, kind="stable")
     order = order[track[order] >= 0]
     labels, index, length = np.unique(track[order], return_inverse=True, return_counts=True)
+    min_length = MIN_TRACK_LENGTH
     while min_length >= 2:
         tracks = np.flatnonzero(length >= min_length)
         if len(tracks) >= _MIN_TRAINING_TRACKS or min_length == 2:
@@ -151,7 +148,7 @@ def _training_rows(track: I64, min_length: int, max_samples: int) -> I64:
         min_length = max(min_length // 2, 2)
     if len(tracks) < _MIN_TRAINING_TRACKS:
         return np.zeros(0, dtype=np.int64)
-    step = max(int(np.ceil(length[tracks].sum() / max_samples)), 1)
+    step = max(int(np.ceil(length[tracks].sum() / MAX_TRAINING_SAMPLES)), 1)
     taken = np.zeros(len(labels), dtype=np.bool_)
     taken[tracks[::step]] = True
     return np.asarray(order[taken[index]], dtype=np.int64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -126,32 +127,19 @@ def create_tsdf_from_depth_resource(
     folder = context.map_folder or Path()
     input_type = _depth_type(dense_depth_resource_input_type)
     with memory_limited(dense_max_memory_gb, "--dense_max_memory_gb"):
-        if update:
-            vi_map, report = update_grids(
-                context.vi_map,
-                folder,
-                rows,
-                options,
-                input_type=input_type,
-                threshold_m=dense_update_threshold_m,
-                progress=context.progress,
-            )
-        else:
-            vi_map, report = fuse_depth(
-                context.vi_map,
-                folder,
-                rows,
-                options,
-                input_type=input_type,
-                overwrite=overwrite,
-                progress=context.progress,
-            )
+        make = (
+            functools.partial(update_grids, threshold_m=dense_update_threshold_m)
+            if update
+            else functools.partial(fuse_depth, overwrite=overwrite)
+        )
+        report = context.apply(make, folder, rows, options, input_type=input_type)
     if dense_result_mesh_output_file is not None:
         from maplab_py.algorithms.dense.meshing import write_map_mesh
 
         file = dense_result_mesh_output_file
-        write_map_mesh(vi_map, folder, file, rows, dense_tsdf_mesh_min_weight, overwrite=overwrite)
-    context.commit(vi_map)
+        write_map_mesh(
+            context.vi_map, folder, file, rows, dense_tsdf_mesh_min_weight, overwrite=overwrite
+        )
     return report
 
 
@@ -197,8 +185,8 @@ def create_esdf_from_depth_resource(
     rows = missions.rows(context.vi_map)
     folder = context.map_folder or Path()
     with memory_limited(dense_max_memory_gb, "--dense_max_memory_gb"):
-        vi_map, report = create_fields(
-            context.vi_map,
+        report = context.apply(
+            create_fields,
             folder,
             rows,
             options,
@@ -206,11 +194,9 @@ def create_esdf_from_depth_resource(
             min_weight=dense_tsdf_mesh_min_weight,
             input_type=_depth_type(dense_depth_resource_input_type),
             overwrite=overwrite,
-            progress=context.progress,
         )
     if file is not None:
-        export_voxels(vi_map, folder, file, rows, overwrite=overwrite)
-    context.commit(vi_map)
+        export_voxels(context.vi_map, folder, file, rows, overwrite=overwrite)
     return report
 
 

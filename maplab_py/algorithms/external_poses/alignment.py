@@ -13,6 +13,8 @@ _ITERATIONS = 50
 _CONVERGED = 1e-9
 _LEAST_ERROR_M = 1e-3
 """Errors below this have equal weight."""
+_LARGEST_TILT_DEG = 15.0
+"""Largest median angle between the verticals of measured orientations and of the map."""
 
 
 class Movement(NamedTuple):
@@ -76,14 +78,13 @@ def with_aligned_base_frame(vi_map: VIMap, mission: int, T_G_M: F64) -> tuple[VI
     )
 
 
-def check_vertical(R_G_S: F64, R_M_S: F64, source: str, *, limit_deg: float = 15.0) -> None:
+def check_vertical(R_G_S: F64, R_M_S: F64, source: str) -> None:
     """Check that measured orientations have z upwards, as those of the map do.
 
     Args:
         R_G_S: Measured quaternions (N, 4).
         R_M_S: Quaternions (N, 4) in the frame of the mission.
         source: Name of the file.
-        limit_deg: Largest median angle between the two verticals.
 
     Raises:
         EstimationError: They do not.
@@ -92,7 +93,7 @@ def check_vertical(R_G_S: F64, R_M_S: F64, source: str, *, limit_deg: float = 15
     verticals = [so3.rotate(so3.inverse(q), up) for q in (R_G_S, R_M_S)]
     cosine = np.clip(np.sum(verticals[0] * verticals[1], axis=-1), -1.0, 1.0)
     angle_deg = float(np.median(np.rad2deg(np.arccos(cosine))))
-    if angle_deg > limit_deg:
+    if angle_deg > _LARGEST_TILT_DEG:
         raise EstimationError(
             f"{source}: its vertical and that of the mission differ by {angle_deg:.0f} deg: turn it so "
             "that z points upwards, name the sensor with --sensor_id, or import it with --as=odometry"

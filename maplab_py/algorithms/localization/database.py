@@ -152,25 +152,19 @@ def features_of_good_landmarks(vi_map: VIMap, features: MapFeatures) -> I64:
     return np.flatnonzero(good[features.descriptors.label])
 
 
-def database_of_summary(
-    summary: SummaryMap, projection: DescriptorProjection | None = None
-) -> LocalizationMap:
+def database_of_summary(summary: SummaryMap) -> LocalizationMap:
     """Build the database from a summary map.
 
-    Args:
-        summary: The summary map.
-        projection: Projection that its descriptors were made with; by default the database's.
-
     Raises:
-        UserError: It holds no projection and none is given, or it is empty.
+        UserError: It holds no projection, or it is empty.
     """
-    if projection is None:
-        if summary.projection is None:
-            raise UserError(
-                "the summary map does not hold the projection of its descriptors: it was written "
-                "by another program"
-            )
-        projection = DescriptorProjection(summary.projection, _kind(summary))
+    if summary.projection is None:
+        raise UserError(
+            "the summary map does not hold the projection of its descriptors: it was written "
+            "by another program"
+        )
+    described = summary.descriptor_kind
+    kind = None if described is None else DescriptorKind(*described)  # None = binary
     count = len(summary.descriptors)
     if count == 0:
         raise UserError("the summary map has no landmark")
@@ -188,15 +182,8 @@ def database_of_summary(
         observer=summary.observer[order].astype(np.int64),
         p_G_observer=summary.p_G_observer.astype(np.float64),
         observer_id=summary.observer_id,
-        projection=projection,
+        projection=DescriptorProjection(summary.projection, kind),
     )
-
-
-def _kind(summary: SummaryMap) -> DescriptorKind | None:
-    """Return the kind of the descriptors that a summary map was made from; None = binary."""
-    if summary.descriptor_kind is None:
-        return None
-    return DescriptorKind(*summary.descriptor_kind)
 
 
 def _group(key: I64, value: I64, groups: int) -> tuple[I64, I64]:

@@ -26,7 +26,6 @@ def list_closures(
     which: str = "accepted",
     missions: I64 | None = None,
     sort_by: str = "time",
-    limit: int = 0,
     reason: str = "",
     descending: bool = False,
 ) -> ClosureReport:
@@ -37,7 +36,6 @@ def list_closures(
         missions: Only closures with an end in these missions (rows); None = all.
         sort_by: "time" of the query, or "gap", "correction" (largest first), "inliers" (fewest
             first), or "near_miss" (fewest failed gates and nearest to the default thresholds first).
-        limit: Most lines; 0 = all.
         reason: Only closures whose verdict contains this text.
         descending: Reverse the order.
 
@@ -65,16 +63,15 @@ def list_closures(
     }[sort_by]
     order = np.lexsort((place, query, key))
     order = order[chosen[order]][:: -1 if descending else 1]
-    shown = order[:limit] if limit > 0 else order
     codes, counts = np.unique(c.verdict[~is_accepted], return_counts=True)
     return ClosureReport(
         recorded=len(c),
         accepted=int(np.count_nonzero(is_accepted)),
         refused={VERDICTS[v].value: int(n) for v, n in zip(codes, counts, strict=True)},
         largest_gap_m=float(gap[is_accepted].max(initial=0.0)),
-        shown=len(shown),
+        shown=len(order),
         file="",
-        closures=tuple(lines[row] for row in shown),
+        closures=tuple(lines[row] for row in order),
         notes=() if len(c) else ("no closures are recorded: lc, relax and aam record them",),
     )
 

@@ -108,7 +108,6 @@ def find_loop_closures(
     vi_map: VIMap,
     options: LoopClosureOptions = _DEFAULT,
     *,
-    missions: I64 | None = None,
     progress: Progress = SILENT,
 ) -> tuple[LoopClosureEdges, LoopClosureReport]:
     """Find loop closures and return them as edges from query to place, for the pose graph.
@@ -116,7 +115,7 @@ def find_loop_closures(
     Raises:
         EstimationError: No descriptors, or too few tracks to learn their projection.
     """
-    search, report = search_loops(vi_map, options, missions=missions, progress=progress)
+    search, report = search_loops(vi_map, options, progress=progress)
     return search.edges, report
 
 
