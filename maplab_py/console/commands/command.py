@@ -206,7 +206,7 @@ def describe(
     if not documentation.summary:
         raise TypeError(f"command {name}: the function has no docstring to serve as help")
     parameters = list(inspect.signature(function).parameters.values())[1:]
-    hints = _parameter_hints(function, [parameter.name for parameter in parameters])
+    hints = parameter_hints(function, [parameter.name for parameter in parameters])
     flags: dict[str, Flag] = {}
     positional: list[str] = []
     defaults: dict[str, Any] = {}
@@ -245,7 +245,7 @@ def describe(
     return dataclasses.replace(described, example=name)
 
 
-def _parameter_hints(function: Callable[..., Any], names: list[str]) -> dict[str, Any]:
+def parameter_hints(function: Callable[..., Any], names: list[str]) -> dict[str, Any]:
     """Evaluate the annotations of flags; other types may be known to type checkers alone."""
     annotations = function.__annotations__
     wanted = {name: annotations[name] for name in names if name in annotations}

@@ -6,7 +6,6 @@ import dataclasses
 import functools
 import inspect
 import types
-import typing
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -101,13 +100,5 @@ def _command_of(function: Callable[..., VIMap]) -> Callable[..., ImportedMap]:
     context = inspect.Parameter("context", inspect.Parameter.POSITIONAL_OR_KEYWORD)
     flags = [p for p in parameters if p.name != "progress"]
     run.__signature__ = inspect.Signature([context, *flags])  # type: ignore[attr-defined]
-    run.__annotations__ = _hints(function, {p.name for p in flags})
+    run.__annotations__ = command.parameter_hints(function, [p.name for p in flags])
     return run
-
-
-def _hints(function: Callable[..., Any], names: set[str]) -> dict[str, Any]:
-    """Return the types of some parameters; others may be known to checkers alone."""
-    wanted = {k: v for k, v in function.__annotations__.items() if k in names}
-    namespace = getattr(function, "__globals__", {})
-    holder = types.SimpleNamespace(__annotations__=wanted)
-    return typing.get_type_hints(holder, globalns=namespace, localns=namespace)
