@@ -40,7 +40,7 @@ from maplab_py.online_calibration.suggestions import (
 )
 from maplab_py.output_files import write_text
 from maplab_py.progress import SILENT
-from maplab_py.sensors import calibration_transfer, sensors_yaml
+from maplab_py.sensors import SensorSet, calibration_transfer, sensors_yaml
 from maplab_py.vimap import VIMap, excerpts, merge, to_hex
 
 OPTIONS = SelfCalibrationOptions(keep_unobservable_at_prior=True)
@@ -323,11 +323,7 @@ class DeviceCalibration:
             sensors,
             calibration_transfer.only_device(sensors),
         )
-        lines = [f"# calibration by {report.segments} segments of {self._options.database}"]
-        lines += [f"# {words(estimate)}; {estimate.verdict}" for estimate in report.parameters]
-        lines += [f"# not observable: {name}" for name in report.unobservable]
-        text = "\n".join(lines) + "\n" + sensors_yaml.write_sensors(calibrated)
-        write_text(self._options.proposal, [text], overwrite=True)
+        write_proposal(self._options, calibrated, report)
         self._proposal = report
         self._calibrated = frozenset(record.key for record in database.records)
         if self._options.applies_later and len(valid) < len(database):
@@ -399,6 +395,21 @@ def _map_of(pieces: list[Piece], device: RecordedSensors) -> VIMap:
         vi_map, _ = init_tracks(vi_map, LandmarkQualityOptions(), across_cameras=True)
         maps.append(excerpts.with_ids_of_times(vi_map, session))
     return functools.reduce(merge.stack, maps)
+
+
+def write_proposal(
+    options: OnlineCalibrationOptions, sensors: SensorSet, report: reports.SelfCalibrationReport
+) -> None:
+    """Write a calibration as sensors.yaml that begins with values and deviations.
+
+    Raises:
+        UserError: It cannot be written.
+    """
+    lines = [f"# calibration by {report.segments} segments of {options.database}"]
+    lines += [f"# {words(estimate)}; {estimate.verdict}" for estimate in report.parameters]
+    lines += [f"# not observable: {name}" for name in report.unobservable]
+    text = "\n".join(lines) + "\n" + sensors_yaml.write_sensors(sensors)
+    write_text(options.proposal, [text], overwrite=True)
 
 
 def words(estimate: reports.ParameterEstimate) -> str:
