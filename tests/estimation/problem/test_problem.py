@@ -284,23 +284,23 @@ def test_the_schedule_of_ceres() -> None:
 
 
 @pytest.mark.parametrize(
-    ("gain", "factor"), [(0.95, 10.0), (1.0, 100.0), (1.05, 10.0), (1.5, 10.0)]
+    ("gain", "factor"),
+    [
+        (0.5, 1.0),
+        (0.97, 3.0),
+        (0.99, 1.0 / (1.0 - 0.98**3)),
+        (1.0, 100.0),
+        (1.01, 1.0 / (1.0 - 0.98**3)),
+        (1.5, 3.0),
+    ],
 )
 def test_steps_as_good_as_promised_widen_most(gain: float, factor: float) -> None:
     it = region(Schedule.STEP_QUALITY)
-    for gain, factor in ((0.5, 1.0), (0.97, 1.0 / (1.0 - 0.94**3)), (0.99, 1.0 / (1.0 - 0.98**3))):
-        before = it.radius
-        it.accept(gain)
-        assert it.radius == pytest.approx(min(factor, 3.0 if gain == 0.97 else 100.0) * before)
+    it.accept(gain)
+    assert it.radius == pytest.approx(factor * 100.0, rel=1e-3)
     before = it.radius
     it.reject()
     assert it.radius == pytest.approx(before / 2.0)
-
-
-def test_a_perfect_step_widens_a_hundredfold() -> None:
-    it = region(Schedule.STEP_QUALITY)
-    it.accept(1.0)
-    assert it.radius == pytest.approx(1e4)
 
 
 @pytest.mark.parametrize("schedule", list(Schedule))
