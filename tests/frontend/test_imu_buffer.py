@@ -82,14 +82,3 @@ def test_wrong_samples_are_refused_in_a_line_and_change_nothing() -> None:
     assert buffer.last_ns == 2 * STEP_NS
     buffer.push(batch(late + STEP_NS))
     assert buffer.last_ns == 20_000_000
-
-
-def test_samples_that_do_not_reach() -> None:
-    buffer = ImuBuffer()
-    assert not buffer.covers(0)
-    buffer.push(batch(np.arange(1, 5) * STEP_NS))
-    assert buffer.covers(4 * STEP_NS)
-    assert not buffer.covers(4 * STEP_NS + 1)
-    for a, b in ((0, 2 * STEP_NS), (STEP_NS, 5 * STEP_NS), (2 * STEP_NS, STEP_NS)):
-        with pytest.raises(ValueError, match="do not reach"):
-            buffer.cut(a, b)

@@ -252,15 +252,6 @@ def empty(frame: TrackedFrame | None) -> TrackedFrame:
     return dataclasses.replace(frame, **{name: getattr(frame, name)[:0] for name in names})
 
 
-def test_samples_must_reach_from_vertex_to_vertex(stereo: VIMap) -> None:
-    builder = MapBuilder(MapRecording(stereo, 0).device, OFTEN)
-    builder.start_mission()
-    frames = (None, None)
-    builder.add_vertex(states_of(stereo, 0), frames)
-    with pytest.raises(ValueError, match="do not reach"):
-        builder.add_vertex(states_of(stereo, 1), frames)
-
-
 def test_what_makes_no_map() -> None:
     vi_map = make_map()
     builder = MapBuilder(MapRecording(vi_map, 0).device)

@@ -141,12 +141,6 @@ def test_a_run_that_is_ended_keeps_what_is_there(tmp_path: Path) -> None:
     assert check_consistency(vi_map).failure == ""
 
 
-def test_a_run_that_is_ended_before_its_first_state_is_cancelled() -> None:
-    recording, start = recording_of()
-    with pytest.raises(Cancelled):
-        Mapping(recording, make_starter=start).run(is_to_end=lambda: True)
-
-
 def test_a_run_that_is_cancelled_saves_nothing(tmp_path: Path) -> None:
     recording, start = recording_of()
     options = options_of(save_map_folder=tmp_path / "map")

@@ -1,15 +1,11 @@
 """Standing still, turning and moving are told apart."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
-from maplab_py.errors import FlagError
 from maplab_py.estimation.window.frame import Motion
 from maplab_py.frontend.imu_buffer import ImuInterval
 from maplab_py.frontend.motion import MotionDetector
-from maplab_py.frontend.odometry_options import RestOptions
 from maplab_py.vision.tracking.tracks import CameraTracks, TrackedImages
 
 STEP_NS = 5_000_000
@@ -100,11 +96,6 @@ def test_rest_needs_half_a_second_of_samples() -> None:
     assert np.isnan(detector.acceleration_deviation)
 
 
-def test_turning_is_what_the_tracker_says() -> None:
-    assert last(MotionDetector(), amplitude=1.0, is_turn_only=True) is Motion.TURNING
-    assert last(MotionDetector(), is_turn_only=True) is Motion.RESTING
-
-
 def test_motion_after_rest_is_noticed_at_once() -> None:
     detector = MotionDetector()
     assert last(detector) is Motion.RESTING
@@ -183,9 +174,3 @@ def test_shaking_back_to_the_same_place_is_no_rest(noise_px: float) -> None:
     """A period of half a second brings every other comparison over half a second back to zero."""
     time_s = np.arange(100) / 20.0
     assert Motion.RESTING not in seen(0.05 * np.sin(4.0 * np.pi * time_s), 20.0, noise_px)
-
-
-@pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(RestOptions)])
-def test_wrong_options(name: str) -> None:
-    with pytest.raises(FlagError, match=f"--vio_rest_{name}=-1"):
-        MotionDetector(dataclasses.replace(RestOptions(), **{name: -1.0}))

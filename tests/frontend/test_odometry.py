@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from maplab_py.errors import FlagError, MapError, UserError
+from maplab_py.errors import FlagError, MapError
 from maplab_py.estimation.window.frame import Motion, WindowFrame
 from maplab_py.estimation.window.smoother import FixedLagSmoother
 from maplab_py.frontend.image_delay import DelayMonitor
@@ -266,27 +266,6 @@ def test_a_long_gap_of_the_imu_starts_a_new_mission() -> None:
     assert errors.max() < 0.1
 
 
-def without_tracks(events: list[Event], from_ns: int) -> list[Event]:
-    """Let all cameras see nothing from a time on."""
-    return [
-        dataclasses.replace(event, frames=(None,) * len(event.frames))
-        if isinstance(event, TrackedFrameSet) and event.time_ns >= from_ns
-        else event
-        for event in events
-    ]
-
-
-def test_darkness_is_noticed_as_divergence() -> None:
-    device, events, start = events_of()
-    dark_ns = events[-1].time_ns - 4_000_000_000
-    updates = pushed(Odometry(device, make_starter=start), without_tracks(events, dark_ns))
-    restart = next(u for u in updates if u.note)
-    assert restart.note.startswith("started again: ")
-    assert restart.state is None
-    assert restart.time_ns > dark_ns
-    assert 0 < restart.healthy_until_ns <= dark_ns
-
-
 @pytest.mark.parametrize(
     ("limits", "reason"),
     [
@@ -343,24 +322,6 @@ def test_frames_without_any_sample() -> None:
     ]
     with pytest.raises(MapError, match="after the last IMU sample: check that the IMU"):
         pushed(odometry, [*frames])
-
-
-def test_saturated_samples_are_counted() -> None:
-    device, events, start = events_of()
-    batch = next(e for e in events if isinstance(e, ImuBatch))
-    batch.is_saturated[:] = True
-    try:
-        odometry = Odometry(device, make_starter=start)
-        pushed(odometry, events[:5])
-        assert odometry.counts.saturated_samples == len(batch)
-    finally:
-        batch.is_saturated[:] = False
-
-
-def test_without_an_imu() -> None:
-    device, _, _ = events_of()
-    with pytest.raises(UserError, match="needs an IMU"):
-        Odometry(dataclasses.replace(device, imu_id=""))
 
 
 def test_a_wrong_mounting_is_estimated_and_given_to_the_sensors() -> None:

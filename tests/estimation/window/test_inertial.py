@@ -10,7 +10,6 @@ from maplab_py.estimation.symbolic import sources
 from maplab_py.estimation.window.frame import ImuPart
 from maplab_py.estimation.window.inertial import InertialChain
 from maplab_py.estimation.window.states import WindowStates
-from maplab_py.geometry import se3
 from maplab_py.sensors import Imu
 
 POSE = np.array([0.1, -0.2, 0.3, 0.9, 1.0, 2.0, 3.0]) / np.array([*[np.sqrt(0.95)] * 4, 1, 1, 1])
@@ -116,17 +115,3 @@ def test_a_doubt_leaves_the_states_as_they_are(chain: InertialChain) -> None:
     chain.doubt(0, ImuPart.GYROSCOPE)
     chain.relinearize(before)
     np.testing.assert_array_equal(motion, before)
-
-
-def test_walk_has_the_density_of_the_imu(chain: InertialChain) -> None:
-    chain.append(*samples(), MOTION, is_resting=False)
-    imu, seconds = Imu("a" * 32), 0.2
-    expected = [
-        1.0 / (imu.gyro_bias_random_walk_noise_density * np.sqrt(seconds)),
-        1.0 / (imu.acc_bias_random_walk_noise_density * np.sqrt(seconds)),
-    ]
-    np.testing.assert_allclose(chain.walk_weight, [expected])
-
-
-def test_pose_of_the_tests_is_a_pose() -> None:
-    np.testing.assert_allclose(se3.compose(POSE, se3.inverse(POSE)), se3.identity(), atol=1e-12)

@@ -10,7 +10,7 @@ from maplab_py.estimation.codegen.kernels import window_kernels
 from maplab_py.estimation.kernels import map_observations as kernels
 from maplab_py.estimation.kernels.window_arguments import DenseSystem
 from maplab_py.estimation.window import localized, warmup
-from maplab_py.estimation.window.alignment import AlignmentProblem, aligned
+from maplab_py.estimation.window.alignment import aligned
 from maplab_py.estimation.window.map_terms import MapObservations, MapTerms
 from maplab_py.estimation.window.states import WindowStates
 from maplab_py.geometry import se3, so3
@@ -220,20 +220,6 @@ def test_alignment_without_noise_is_exact() -> None:
     assert np.linalg.eigvalsh(covariance).min() > 0.0
 
 
-def test_alignment_gradient_is_the_derivative_of_its_cost() -> None:
-    terms, states = window()
-    problem = AlignmentProblem(terms, se3.retract(T_G_M, np.full(6, 0.05)), WEAK)
-    linear = problem.linearize(states, 0.0)
-    for k in range(6):
-        step = np.zeros(15 * FRAMES + 6)
-        step[-6 + k] = 1e-6
-        ahead, behind = (
-            sum(problem.linearize(states.moved(s * step, states.h), 0.0).costs.values())
-            for s in (1, -1)
-        )
-        assert linear.gradient[k] == pytest.approx((ahead - behind) / 2e-6, rel=1e-4, abs=1e-3)
-
-
 def test_residuals_are_those_of_the_camera_models() -> None:
     """The compiled kernel projects as `sensors.projection` does, with every model of cameras."""
     terms, states = window()
@@ -260,16 +246,6 @@ def test_the_warmup_compiles_what_terms_evaluate() -> None:
     assert ahead == set(kernel.signatures)
     assert ahead_by_hand == [set(k.signatures) for k in by_hand]
     assert ahead
-
-
-def test_equations_of_the_base_frame_are_those_of_the_whole_system() -> None:
-    terms, states = window()
-    system = DenseSystem.zeros(15 * FRAMES + 6)
-    _, costs = terms.add_to(system, states, states)
-    square, gradient, of_base = terms.of_base_frame(states)
-    np.testing.assert_allclose(np.tril(square), np.tril(system.matrix[-6:, -6:]), rtol=1e-11)
-    np.testing.assert_allclose(gradient, system.gradient[-6:], rtol=1e-10)
-    assert of_base == costs
 
 
 def test_composition_jacobian_is_that_of_differences() -> None:

@@ -30,14 +30,6 @@ def linear_system(frames: int, rng: np.random.Generator) -> tuple[F64, F64]:
     return J.T @ J, J.T @ r
 
 
-def test_marginalising_equals_solving_jointly() -> None:
-    rng = np.random.default_rng(1)
-    H, g = linear_system(4, rng)
-    jointly = np.linalg.solve(H, -g)
-    reduced, gradient = schur_complement(H, g, np.arange(15))
-    np.testing.assert_allclose(np.linalg.solve(reduced, -gradient), jointly[15:], rtol=1e-9)
-
-
 def test_prior_has_the_information_it_was_made_of() -> None:
     rng = np.random.default_rng(2)
     H, g = linear_system(3, rng)

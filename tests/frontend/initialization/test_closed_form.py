@@ -107,13 +107,6 @@ def test_the_bias_of_the_gyroscope(cameras: int, seed: int) -> None:
     assert error < 4e-3
 
 
-def test_the_bias_shows_in_a_turn_on_the_spot_too() -> None:
-    flight = fly(lively(3, 2.0, metres=0.0, turn_rad=0.4), seed=3, points=1500)
-    segment, rays = segment_of(flight)
-    bias = estimate_gyro_bias(segment.inertial, ray_pairs(rays))
-    assert np.linalg.norm(bias - flight.gyro_bias[-1]) < 4e-3
-
-
 def test_without_common_tracks_the_bias_is_zero() -> None:
     flight = fly(lively(1, 1.0), points=20)
     segment, rays = segment_of(flight)

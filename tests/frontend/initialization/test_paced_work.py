@@ -25,11 +25,6 @@ def test_no_more_is_done_than_allowed_but_for_the_last_part() -> None:
     assert result == "result"
 
 
-def test_all_at_once() -> None:
-    assert finished(counting([], [1.0, 2.0])) == "result"
-    assert PacedWork(counting([], [1.0, 2.0])).advance(1e9) == "result"
-
-
 def test_steps_are_counted() -> None:
     def steps() -> Generator[None, None, int]:
         yield

@@ -62,11 +62,3 @@ def test_a_gap_in_the_samples_starts_again() -> None:
     history.push(frame(7))
     history.push(frame(7))
     assert len(history) == 1
-
-
-def test_a_single_frame_has_no_edges() -> None:
-    imu = device().imu
-    assert imu is not None
-    segment = filled(1).segment(imu, 0.1)
-    assert len(segment) == 1
-    assert len(segment.inertial) == 0
