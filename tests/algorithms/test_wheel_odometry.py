@@ -284,9 +284,6 @@ def test_wrong_files_are_refused(
         {"wheel_position_m": "1,2"},
         {"wheel_orientation_xyzw": "0,0,0,2"},
         {"wheel_orientation_xyzw": "0,0,1"},
-        {"wheel_position_sigma_m": 0.0},
-        {"wheel_tilt_sigma_deg": -1.0},
-        {"wheel_max_gap_s": 0.0},
         {"wheel_time_offset_s": float("inf")},
     ],
 )

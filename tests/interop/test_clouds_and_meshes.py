@@ -198,13 +198,6 @@ CORNERS = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0
 FACES = np.array([[0, 2, 1], [0, 1, 3]], dtype=np.int32)
 
 
-def test_ply(tmp_path: Path) -> None:
-    write_mesh(CORNERS, FACES, tmp_path / "mesh.ply")
-    cloud = parse_ply((tmp_path / "mesh.ply").read_bytes(), "mesh.ply")
-    np.testing.assert_array_equal(cloud.p, CORNERS)
-    np.testing.assert_array_equal(cloud.faces, FACES)
-
-
 def test_obj(tmp_path: Path) -> None:
     write_mesh(CORNERS, FACES, tmp_path / "mesh.obj")
     text = (tmp_path / "mesh.obj").read_text()
@@ -248,25 +241,6 @@ def test_glb(tmp_path: Path) -> None:
     np.testing.assert_array_equal(indices, FACES)
     assert place["max"] == [1.0, 3.0, 0.0]
     assert len(data) % 4 == 0
-
-
-def test_colours(tmp_path: Path) -> None:
-    colours = np.arange(12, dtype=np.uint8).reshape(4, 3) * 20
-    for suffix in ("ply", "obj", "stl", "glb"):
-        write_mesh(CORNERS, FACES, tmp_path / f"mesh.{suffix}", colours)
-    cloud = parse_ply((tmp_path / "mesh.ply").read_bytes(), "mesh.ply")
-    np.testing.assert_array_equal(cloud.colours, colours)
-    lines = (tmp_path / "mesh.obj").read_text().splitlines()
-    read = [list(map(float, line.split()[4:])) for line in lines if line.startswith("v ")]
-    np.testing.assert_allclose(read, colours / 255.0, atol=1e-4)
-    data = (tmp_path / "mesh.glb").read_bytes()
-    scene = json.loads(data[20 : 20 + int(np.frombuffer(data, "<u4", 1, 12)[0])])
-    place = scene["accessors"][scene["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
-    view = scene["bufferViews"][place["bufferView"]]
-    body = data[len(data) - scene["buffers"][0]["byteLength"] :]
-    painted = np.frombuffer(body, np.uint8, 16, view["byteOffset"]).reshape(4, 4)
-    np.testing.assert_array_equal(painted[:, :3], colours)
-    assert (painted[:, 3] == 255).all()
 
 
 def test_other_formats_and_existing_files_are_refused(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from maplab_py.errors import MapError
 from maplab_py.sensors import Camera, Distortion, Projection
-from maplab_py.sensors.camera import CAMERA_MODELS, is_known_to_maplab, parameter_names
+from maplab_py.sensors.camera import CAMERA_MODELS
 from maplab_py.sensors.projection import (
     back_project,
     is_inside_image,
@@ -214,14 +214,6 @@ def test_cameras_without_meaning_are_refused(projection, distortion, mirror, mes
         Camera("0" * 32, projection, distortion, intrinsics, parameters, 512, 512)
 
 
-def test_parameters_have_names_and_maplab_knows_eight_models() -> None:
-    for model in MODELS:
-        camera = make_camera(*model)
-        size = len(camera.intrinsics) + len(camera.distortion_parameters)
-        assert len(parameter_names(*model)) == size
-    assert sum(is_known_to_maplab(*model) for model in MODELS) == 8
-
-
 def test_folded_distortion_is_not_visible() -> None:
     camera = dataclasses.replace(
         make_camera(Projection.PINHOLE, Distortion.RADTAN),
@@ -240,16 +232,6 @@ def test_pixels_without_a_ray_are_flagged() -> None:
     ray, valid = back_project(camera, np.array([[1e4, 0.0], [np.nan, 0.0], [367.0, 248.0]]))
     assert valid.tolist() == [False, False, True]
     assert np.isfinite(ray).all()
-
-
-def test_batches_of_any_shape() -> None:
-    camera = make_camera(Projection.PINHOLE, Distortion.RADTAN)
-    p = points(24).reshape(2, 3, 4, 3)
-    uv, visible = project(camera, p)
-    assert (uv.shape, visible.shape) == ((2, 3, 4, 2), (2, 3, 4))
-    assert project(camera, p[0, 0, 0])[0] == pytest.approx(uv[0, 0, 0])
-    assert project(camera, np.zeros((0, 3)))[0].shape == (0, 2)
-    assert back_project(camera, uv)[0].shape == p.shape
 
 
 def test_inside_image_is_half_open() -> None:

@@ -435,14 +435,6 @@ def test_clouds_and_meshes() -> None:
     np.testing.assert_array_equal(mesh.colours, own[:5])
 
 
-def test_missions_in_the_panel(two_missions: VIMap) -> None:
-    first, second = _scene(two_missions).missions
-    assert (first.vertices, second.vertices) == (12, 9)
-    assert first.duration_s == pytest.approx(1.1)
-    assert first.length_m == pytest.approx(second.length_m * 11 / 8, rel=0.05)
-    assert first.colour != second.colour
-
-
 def test_an_empty_map_is_refused() -> None:
     with pytest.raises(UserError, match="'empty' has no vertices"):
         build_scene(Subject(VIMap(), "empty"))

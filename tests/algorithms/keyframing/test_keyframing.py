@@ -88,11 +88,6 @@ def test_rotations_of_exactly_the_threshold_are_not_enough():
     assert np.flatnonzero(chosen == Reason.ROTATION)[0] == 3
 
 
-def test_the_nth_vertex_itself_is_a_keyframe():
-    chosen = choose_keyframes(straight_map(), KeyframingOptions(**{**LOOSE, "every_nth_vertex": 4}))
-    assert np.flatnonzero(chosen == Reason.EVERY_NTH).tolist() == [4, 8]
-
-
 def test_as_many_shared_landmarks_as_wanted_are_enough():
     m = straight_map()
     observed = [

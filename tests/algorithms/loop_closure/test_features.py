@@ -50,11 +50,6 @@ def test_the_angle_of_a_pixel_is_that_of_its_neighbourhood():
     np.testing.assert_allclose(angle[ok], np.sqrt(area[ok]), rtol=0.03)
 
 
-def test_no_keypoints_have_no_rays():
-    ray, angle, ok = bearings(CAMERA, np.zeros((0, 2)))
-    assert len(ray) == len(angle) == len(ok) == 0
-
-
 def test_missions_with_descriptors_of_different_sizes_are_not_mixed():
     vi_map, _ = make_map([Walk(room=1), Walk(room=1, mission=1, vertices=8)])
     frames, mission = vi_map.frames, vi_map.vertices.mission[vi_map.frames.vertex]

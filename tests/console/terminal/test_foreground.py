@@ -290,14 +290,6 @@ def test_ctrl_c_at_a_question_cancels(runner: Runner, monkeypatch: pytest.Monkey
     assert runner.run_text("echo on") == Status.OK
 
 
-def test_errors_reach_the_caller() -> None:
-    def fail() -> None:
-        raise ZeroDivisionError("as it was")
-
-    with pytest.raises(ZeroDivisionError, match="as it was"):
-        run_in_foreground("failing", fail)
-
-
 def test_inside_a_command_another_runs_under_the_same_token() -> None:
     def outer() -> None:
         press_ctrl_c()

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from maplab_py.console.terminal.drawing import GAP, drawn, fitted
 from maplab_py.console.terminal.layout import Pairs, Table, blocks_of, format_column
 from maplab_py.console.terminal.render import names_by_id, text_with_names, with_links, with_names
-from maplab_py.report import Message, Report, counted
+from maplab_py.report import Message, Report
 
 WORDS = st.text("abcdefgh.0123456789", min_size=1, max_size=12)
 TEXTS = st.lists(WORDS, min_size=0, max_size=4).map(" ".join)
@@ -69,14 +69,6 @@ def test_a_table_of_many_rows_names_the_columns_that_have_no_room() -> None:
     assert "what to do about it" in " ".join(text.split())
 
 
-@pytest.mark.parametrize("columns", [40, 80, 150])
-def test_numbers_are_whole_on_a_terminal(columns: int) -> None:
-    lines = drawn(closures(), columns, coloured=False).splitlines()
-    assert max(map(len, lines)) <= columns
-    for text in ("a243b811", "61dc0de3", "105.9200", "1.3540", "accepted"):
-        assert sum(line.split().count(text) for line in lines) >= 2, text
-
-
 @pytest.mark.parametrize(
     ("values", "cells"),
     [
@@ -132,12 +124,6 @@ def test_headings_keep_names_of_transformations_and_give_units() -> None:
 def test_what_is_empty_has_no_heading() -> None:
     blocks = blocks_of(dataclasses.replace(Sample(), none_of_these={"a": 1}))
     assert [getattr(block, "title", "") for block in blocks] == ["", "none of these"]
-
-
-def test_nouns_follow_their_numbers() -> None:
-    assert counted(1, "map") == "1 map"
-    assert counted(0, "map") == "0 maps"
-    assert counted(2, "vertex", "vertices") == "2 vertices"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -342,20 +328,6 @@ def test_rounding_noise_is_zero_and_has_no_sign() -> None:
     text = shown(Spreads(1, *(Spread(-3e-17, 2e-15) for _ in range(3))), 80)
     assert "e-1" not in text
     assert "-0" not in text
-
-
-@dataclasses.dataclass(frozen=True)
-class Units(Report):
-    seconds: float
-    megabytes: float
-    chi_square_per_freedom: float
-    ids: tuple[str, ...]
-
-
-def test_quantities_have_names_and_ids_stand_in_one_line() -> None:
-    text = shown(Units(1.0, 2.0, 1.0, tuple(f"{n:08x}" for n in range(11))), 200)
-    heads = [line.partition("  ")[0] for line in text.splitlines()]
-    assert heads == ["time [s]", "size [MB]", "chi square per degree of freedom", "ids"]
 
 
 def test_help_never_leaves_out_the_text_of_a_flag() -> None:
