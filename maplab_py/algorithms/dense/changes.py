@@ -12,6 +12,9 @@ from maplab_py.vimap import VIMap, resources_of
 
 _FREE_VOXELS = 1.5
 """Distance from all surfaces at which space was surely free: those of two sessions differ by a voxel."""
+_NO_STEP = 0.99
+"""Distance, as a share of the truncation, that no voxel beside a surface has: where free space lies beside the
+inside of an object without one between, the object only hides what is behind it."""
 _MIN_AREA_M2 = 0.02
 """Area of a connected surface that is shown."""
 
@@ -33,7 +36,7 @@ def changed_surfaces(
         MapError: A file is missing or damaged.
         EstimationError: A grid has no surface of this weight.
     """
-    meshes = [meshing.map_mesh(*state, None, min_weight)[0] for state in (before, after)]
+    meshes = [meshing.map_mesh(*state, None, min_weight, _NO_STEP)[0] for state in (before, after)]
     appeared = _large_parts(meshes[1], _is_free(*before, meshes[1].p))
     return appeared, _large_parts(meshes[0], _is_free(*after, meshes[0].p))
 

@@ -145,15 +145,15 @@ class TsdfGrid:
         """Take out a depth map that was integrated with the same arguments."""
         self._integrate(depth, pinhole, T_G_C, -1.0, 0)
 
-    def mesh(self, min_weight: float) -> Mesh:
-        """Return the surface between voxels of at least this weight."""
+    def mesh(self, min_weight: float, most: float = np.inf) -> Mesh:
+        """Return the surface between voxels of at least this weight, and of distances up to `most`."""
         around = np.empty((self.count, grid_kernels.NEIGHBOURS), dtype=np.int32)
         grid_kernels.find_neighbours(self.coordinates, self._table, around)
         cells = np.empty(
             (self.count, grid_kernels.BLOCK_SIDE, grid_kernels.BLOCK_SIDE, grid_kernels.BLOCK_SIDE),
             dtype=np.int32,
         )
-        settings = np.array([self.settings.voxel_size_m, max(min_weight, 1e-12)])
+        settings = np.array([self.settings.voxel_size_m, max(min_weight, 1e-12), most])
         arguments = self.coordinates, around, self.distance, self.weight, settings, cells
         points = np.empty((grid_kernels.place_vertices(*arguments, np.empty((0, 3))), 3))
         quads = np.empty((0, 4), dtype=np.int32)

@@ -283,11 +283,11 @@ def read_block(
 
 
 @compiled()
-def place_vertex(corners: F32, p: F64) -> bool:
-    """Put the vertex (3,) of a cell of side 1; False if the surface does not pass through it."""
+def place_vertex(corners: F32, most: float, p: F64) -> bool:
+    """Put the vertex (3,) of a cell of side 1; False if no surface with distances up to `most` passes it."""
     negative = 0
     for m in range(8):
-        if np.isnan(corners[m]):
+        if np.isnan(corners[m]) or corners[m] > most:
             return False
         negative += corners[m] < 0
     if negative in (0, 8):
@@ -322,7 +322,8 @@ def place_vertices(
         around: Rows (B, 27) of the blocks around each.
         distance: Distances (B, 8, 8, 8).
         weight: Weights (B, 8, 8, 8).
-        settings: Voxel size [m] and the weight from which a voxel counts as observed.
+        settings: Voxel size [m], the weight from which a voxel counts as observed, and the largest distance
+            of a voxel beside a surface.
         cells: Numbers (B, 8, 8, 8) of the vertices to fill, -1 = none.
         points: Vertices (N, 3) to fill [m]; with N = 0 they are only counted.
     """
@@ -339,7 +340,7 @@ def place_vertices(
                     cells[block, i, j, k] = -1
                     for m in range(8):
                         corners[m] = values[i + (m & 1), j + (m >> 1 & 1), k + (m >> 2)]
-                    if not place_vertex(corners, p):
+                    if not place_vertex(corners, settings[2], p):
                         continue
                     if len(points):
                         for axis, index in enumerate((i, j, k)):
@@ -414,6 +415,6 @@ def compile_kernels() -> None:
     integrate_depth(depth, image, np.eye(4), settings, blocks, voxels, voxels.copy())
     around = np.full((1, NEIGHBOURS), -1, dtype=np.int32)
     cells = np.full(voxels.shape, -1, dtype=np.int32)
-    settings = np.array([0.1, 1.0])
+    settings = np.array([0.1, 1.0, 1.0])
     place_vertices(blocks, around, voxels, voxels, settings, cells, np.zeros((0, 3)))
     join_vertices(around, voxels, cells, np.zeros((0, 4), dtype=np.int32))

@@ -32,6 +32,7 @@ def map_mesh(
     map_folder: Path,
     missions: I64 | None = None,
     min_weight: float = options.MESH_MIN_WEIGHT,
+    most: float = np.inf,
 ) -> tuple[grid.Mesh, int]:
     """Return the surface of the grids of missions in G, and the number of grids.
 
@@ -39,6 +40,7 @@ def map_mesh(
         map_folder: Its folder.
         missions: Rows of missions; None = all.
         min_weight: Weight from which voxels count as observed.
+        most: Largest distance of a voxel beside a surface, as a share of the truncation.
 
     Raises:
         UserError: There is no grid.
@@ -48,7 +50,7 @@ def map_mesh(
     grids = fusion.load_grids(vi_map, map_folder, missions)
     points, faces, count = [], [], 0
     for mission, stored in grids:
-        mesh = stored.grid.mesh(min_weight)
+        mesh = stored.grid.mesh(min_weight, most)
         points.append(se3.transform(vi_map.T_G_M[mission], mesh.p))
         faces.append(mesh.faces + np.int32(count))
         count += len(mesh.p)
