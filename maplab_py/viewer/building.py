@@ -124,7 +124,7 @@ def scene_of(drawing: Drawing, subject: Subject) -> Scene:
     layers: list[Layer] = [
         paths.trajectories(drawing),
         paths.vertices(drawing),
-        paths.path_ends(drawing),
+        dataclasses.replace(paths.path_ends(drawing), is_visible=not subject.changes),
     ]
     layers += landmarks.landmarks(drawing)
     layers += [paths.loop_closures(drawing), paths.absolute_poses(drawing)]

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 
 from maplab_py.algorithms.dense.grid import Mesh
@@ -20,10 +21,12 @@ _EDGES = np.array(
     [[a, b] for a in range(8) for b in range(a) if np.abs(_CORNERS[a] - _CORNERS[b]).sum() == 1.0]
 )
 _GAP_PX = 6
+_CAPTION = 12
+"""Width of an image in heights of the line above it: the panel shows both images small."""
 
 
 def change_layers(drawing: Drawing, changes: Sequence[Change]) -> list[Layer]:
-    """Return a layer of boxes round the regions, with lines to where they moved, and one of names.
+    """Return a layer of boxes round the regions, with lines to where they moved, and one of names on them.
 
     A click on a name selects the vertex that saw the region best before the change.
     """
@@ -42,9 +45,9 @@ def change_layers(drawing: Drawing, changes: Sequence[Change]) -> list[Layer]:
     boxes = make_segments(p[:, 0], p[:, 1], np.array(colour), np.array(rows), 3.0)
     before = drawing.vi_map.vertex_index.rows(_ids([c.view_before for c in changes]))
     named = np.flatnonzero(before >= 0)
-    centres = np.array([[c.x_m, c.y_m, c.z_m] for c in changes]) - drawing.origin_G
+    tops = np.array([[c.x_m, c.y_m, c.z_m + 0.5 * c.size_m] for c in changes]) - drawing.origin_G
     tints = np.concatenate([colours.from_hex(_COLOURS[c.change]) for c in changes])
-    dots = make_points(centres[named], tints[named], before[named], 0.004 * drawing.unit_m)
+    dots = make_points(tops[named], tints[named], before[named], 0.012 * drawing.unit_m)
     labels = [f"{changes[row].change} by {changes[row].until}" for row in named.tolist()]
     names: dict[str, Part] = {WHOLE_MAP: dataclasses.replace(dots, labels=tuple(labels))}
     lines_of: dict[str, Part] = {WHOLE_MAP: boxes}
@@ -81,10 +84,11 @@ class ChangeImages:
 
     def __call__(self, vertex: int) -> U8 | None:
         """Return the picture of a vertex (row) of the map, or both pictures of a change."""
-        images = [self._image_of[0](vertex)]
-        if self._after.get(vertex, -1) >= 0:
-            images.append(self._image_of[1](self._after[vertex]))
-        shown = [image for image in images if image is not None]
+        if self._after.get(vertex, -1) < 0:
+            return self._image_of[0](vertex)
+        images = self._image_of[0](vertex), self._image_of[1](self._after[vertex])
+        named = zip(images, ("before", "after"), strict=True)
+        shown = [_captioned(image, name) for image, name in named if image is not None]
         if not shown:
             return None
         height = max(len(image) for image in shown)
@@ -94,6 +98,16 @@ class ChangeImages:
             part[: len(image), : image.shape[1]] = image
             parts.append(part)
         return np.concatenate(parts, axis=1)
+
+
+def _captioned(image: U8, caption: str) -> U8:
+    """Return an image under a line of text."""
+    height = max(image.shape[1] // _CAPTION, 2)
+    line = np.full((height, image.shape[1], 3), 255, dtype=np.uint8)
+    place, width = (0, height - height // 4), max(height // 12, 1)
+    font = cv2.FONT_HERSHEY_SIMPLEX
+    cv2.putText(line, caption, place, font, height / 32, (0, 0, 0), width, cv2.LINE_AA)
+    return np.concatenate([line, image])
 
 
 def _ids(words: Sequence[str]) -> U64:

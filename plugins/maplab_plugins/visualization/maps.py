@@ -229,7 +229,8 @@ def visualize_changes(
         report.changes,
     )
     count = counted(len(report.changes), "change")
-    note = f"{count} from {report.earlier} to {report.later}; {report.note}".rstrip("; ")
+    dates = (date.replace("T", " ")[:-3] for date in (report.earlier, report.later))
+    note = f"{count} from {' to '.join(dates)}; {report.note}".rstrip("; ")
     subject = Subject(
         context.vi_map, context.map_key, options, changes=report.changes, note=note,
         clouds=mesh_clouds(changed_meshes(context, whole, other, session)),

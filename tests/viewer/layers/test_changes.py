@@ -56,9 +56,9 @@ def test_images_of_a_change_are_side_by_side() -> None:
     )
     both = images(2)
     assert both is not None
-    assert both.shape == (8, 32, 3)
-    assert (both[0, 0, 0], both[7, 20, 0], both[7, 0, 0]) == (2, 102, 255)
+    assert both.shape == (10, 32, 3)
+    assert (both[7, 0, 0], both[9, 20, 0], both[9, 0, 0]) == (2, 102, 255)
     single = images(1)
     assert single is not None
-    assert single.shape == (6, 16, 3)
+    assert single.shape == (6, 10, 3)
     assert images(7) is None
