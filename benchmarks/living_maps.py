@@ -2,9 +2,11 @@
 
 python -m benchmarks.living_maps [SEED ...] [--sessions=30] [--results=FILE]
 
-Every session updates four maps: one that keeps everything, and three within the budget of session 3 (its
-landmarks and vertices), by evidence, by observer counts, and by keeping the newest sessions. The next session
-is localised in each of them. A line of JSON is written per session and map.
+Every session updates five maps: one that keeps everything, and four within the budget of session 3 (its
+landmarks and vertices): by evidence, by observer counts, by these without the inertial measurements of old
+sessions as evidence has it (`packed`), and by keeping the newest sessions. Observer counts alone, of
+`landmark_sparsify` and `remove_covered_vertices`, have no more megabytes than evidence. The next session is
+localised in each of them. A line of JSON is written per session and map.
 """
 
 from __future__ import annotations
@@ -159,16 +161,31 @@ def mean_deviation(bins: list[list[float]]) -> float:
     return float(np.abs(table[:, 1] - table[:, 2]).sum() / max(table[:, 0].sum(), 1.0))
 
 
-def keep_newest(vi_map: VIMap, landmarks: int, vertices: int) -> VIMap:
+def keep_newest(vi_map: VIMap, landmarks: int, vertices: int, _: float) -> VIMap:
     """Return the map with the newest missions that fit, and their most useful landmarks."""
     counts = np.diff(vi_map.vertex_start)
     order = np.argsort(-vi_map.vertices.timestamp_ns[vi_map.vertex_start[:-1]], kind="stable")
     dropped = np.zeros(len(counts), dtype=np.bool_)
     dropped[order[np.cumsum(counts[order]) > vertices]] = True
-    return by_counts(remove_missions(vi_map, dropped), landmarks, vertices)
+    return chosen_by_counts(remove_missions(vi_map, dropped), landmarks, vertices)
 
 
-def by_counts(vi_map: VIMap, landmarks: int, vertices: int) -> VIMap:
+def by_counts(vi_map: VIMap, landmarks: int, vertices: int, megabytes: float) -> VIMap:
+    """Return the map chosen by observer counts, of both budgets the same share that fits the megabytes."""
+    share, result = 1.0, chosen_by_counts(vi_map, landmarks, vertices)
+    while size_mb(result) > megabytes:
+        share *= max(0.97 * megabytes / size_mb(result), 0.5)
+        most = max(int(share * landmarks), 1), max(int(share * vertices), 1)
+        result = chosen_by_counts(vi_map, *most)
+    return result
+
+
+def packed(vi_map: VIMap, landmarks: int, vertices: int, _: float) -> VIMap:
+    """Return the map chosen by observer counts, old sessions without inertial measurements."""
+    return by_evidence(with_evidence(vi_map, None), landmarks, vertices, np.inf)
+
+
+def chosen_by_counts(vi_map: VIMap, landmarks: int, vertices: int) -> VIMap:
     """Return the map with landmarks chosen by observer counts, and vertices that cover them."""
     vi_map = with_evidence(vi_map, None)
     if len(vi_map.landmarks) > landmarks:
@@ -184,7 +201,7 @@ def by_counts(vi_map: VIMap, landmarks: int, vertices: int) -> VIMap:
     return vi_map
 
 
-def by_evidence(vi_map: VIMap, landmarks: int, vertices: int) -> VIMap:
+def by_evidence(vi_map: VIMap, landmarks: int, vertices: int, _: float) -> VIMap:
     """Return the map within the budget by the evidence of its sessions."""
     is_new = np.zeros(len(vi_map.missions), dtype=np.bool_)
     is_new[-1] = True
@@ -192,10 +209,11 @@ def by_evidence(vi_map: VIMap, landmarks: int, vertices: int) -> VIMap:
     return thin(vi_map, is_new, options, _PERSISTENCE)[0]
 
 
-METHODS: dict[str, Callable[[VIMap, int, int], VIMap]] = {
+METHODS: dict[str, Callable[[VIMap, int, int, float], VIMap]] = {
     "evidence": by_evidence,
     "everything": lambda vi_map, *_: vi_map,
     "counts": by_counts,
+    "packed": packed,
     "newest": keep_newest,
 }
 
@@ -212,6 +230,7 @@ def run(
     base = prepare_session(first.vi_map)
     base = base.replace(baseframes=base.baseframes.replace(is_known=np.ones(1, dtype=np.bool_)))
     maps, budget = dict.fromkeys(methods, base), (0, 0)
+    megabytes = np.inf  # of the map by evidence, the first of the methods
     for number in range(1, sessions):
         simulated = simulator.session(number)
         truth = truth.extended(simulated.truth)
@@ -232,7 +251,8 @@ def run(
                 line |= {"false_match": report.false_match, "detection": report.detection}
                 line["calibration"] = calibration(whole, truth, number)
             if number >= BUDGET_SESSIONS:
-                whole = METHODS[name](whole, *budget)
+                whole = METHODS[name](whole, *budget, megabytes)
+                megabytes = size_mb(whole) if name == "evidence" else megabytes
             if name == "everything" and number == sessions - 1 >= REFURBISHED:
                 line["objects"] = objects(whole, truth, simulator.world, numbers, REFURBISHED)
             line["update_s"] = time.process_time() - begin

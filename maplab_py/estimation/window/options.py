@@ -4,11 +4,14 @@ import dataclasses
 
 import numpy as np
 
+from maplab_py.array_types import F64
 from maplab_py.options import Options, option
 
 CALIBRATED = ("extrinsics", "time_offset", "intrinsics", "line_delay")
 """Groups of numbers of a calibration that can be estimated."""
 _RIG_KEYFRAMES, _MONO_KEYFRAMES = 7, 12
+_OUTLIER_MEDIANS, _LEAST_GATE_SIGMAS = 8.0, 0.5
+"""Errors beyond so many medians are outliers within the gate, too, if they exceed so many deviations."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,6 +92,15 @@ class WindowOptions(Options, prefix="vio_"):
         if self.follows_thesis:
             return self.thesis_num_keyframes
         return self.num_keyframes or (_RIG_KEYFRAMES if cameras > 1 else _MONO_KEYFRAMES)
+
+    def largest_error_px(self, sigma_px: F64, median_px: float) -> F64:
+        """Return the largest errors (O,) of observations with these deviations, in a window with this median.
+
+        Tracks of sharp images fit much better than their deviations say; those on people who walk slowly
+        would stay within the gate.
+        """
+        usual_px = np.maximum(_OUTLIER_MEDIANS * median_px, _LEAST_GATE_SIGMAS * sigma_px)
+        return np.asarray(np.minimum(np.sqrt(self.gate_chi2) * sigma_px, usual_px))
 
     @property
     def follows_thesis(self) -> bool:

@@ -368,10 +368,10 @@ class FixedLagSmoother:
         if not len(order):
             return float("nan")
         error, depth = problem.errors(self._states)
-        sigma = self.tracks.observations.sigma_px[order]
-        bad = (error**2 > self.options.gate_chi2 * sigma**2) | (depth <= 0.0)
+        sigma, median = self.tracks.observations.sigma_px[order], float(np.median(error))
+        bad = (error > self.options.largest_error_px(sigma, median)) | (depth <= 0.0)
         self._remove(order[bad])
-        return float(np.median(error))
+        return median
 
     def _remove(self, observations: I64) -> None:
         if len(observations):

@@ -277,3 +277,10 @@ def test_thesis_policy_keeps_few_landmarks(noisy: SimulatedTracks) -> None:
     assert max(update.num_frames for update in updates) <= 5 + 3
     error = se3.local(updates[-1].state.T_M_I[0], noisy.T_M_I[-1])
     assert np.linalg.norm(error[:3]) < 0.03
+
+
+def test_errors_far_beyond_the_others_of_sharp_images_are_outliers() -> None:
+    options, sigma = WindowOptions(gate_chi2=9.0), np.array([0.5, 1.0])
+    np.testing.assert_allclose(options.largest_error_px(sigma, 0.01), [0.25, 0.5])
+    np.testing.assert_allclose(options.largest_error_px(sigma, 0.1), [0.8, 0.8])
+    np.testing.assert_allclose(options.largest_error_px(sigma, 0.25), [1.5, 2.0])
