@@ -13,8 +13,8 @@ from maplab_py.vimap import VIMap, resources_of
 _FREE_VOXELS = 1.5
 """Distance from all surfaces at which space was surely free: those of two sessions differ by a voxel."""
 _NO_STEP = 0.99
-"""Distance, as a share of the truncation, that no voxel beside a surface has: where free space lies beside the
-inside of an object without one between, the object only hides what is behind it."""
+"""Distance, as a share of the truncation, that no voxel beside a surface has: where free space and the inside
+of an object meet at once, the object only hides what is behind it."""
 _MIN_AREA_M2 = 0.02
 """Area of a connected surface that is shown."""
 
