@@ -112,7 +112,7 @@ def export_mcap(
         mcap_images: Write the images of the map's resources, too.
         overwrite: Replace a recording that exists.
     """
-    from maplab_py.interop.bags.map_scene import export_mcap as write
+    from maplab_py.interop.bags.exporting import export_mcap as write
 
     return write(
         context.vi_map,

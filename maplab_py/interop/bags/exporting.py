@@ -1,7 +1,10 @@
-"""A mission of a map as a bag: poses, IMU samples, and the images and clouds among its resources."""
+"""A mission of a map as a bag: poses, IMU samples, and the images and clouds among its resources.
+
+A whole map as an mcap recording, for Foxglove and other viewers of robotics.
+"""
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +14,17 @@ from maplab_py.errors import UserError
 from maplab_py.interop.bags import sensor_messages
 from maplab_py.interop.bags.options import BagExportOptions, BagReport, written_topics
 from maplab_py.interop.bags.poses import TF_TOPIC, TF_TYPE
-from maplab_py.interop.ply import parse_ply
+from maplab_py.interop.ply import PlyCloud, parse_ply
 from maplab_py.interop.recordings import bag_layouts, bag_writing, map_replay
 from maplab_py.progress import SILENT, Progress
 from maplab_py.storage.resources.store import ResourceStore
-from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap, queries, to_hex
+from maplab_py.vimap import LandmarkQuality, MissionSensor, ResourceOwner, VIMap, queries, to_hex
 
-IMAGES, _DEPTH, _CLOUDS = (0, 4), (8,), (16, 17, 21)
+_IMAGES, _DEPTH, _CLOUDS = (0, 4), (8,), (16, 17, 21)
 """Numbers of the resource types."""
+_POSE = "geometry_msgs/msg/PoseStamped"
+_FRAME = "map"
+_CLOSURE_COLOUR = (0.9, 0.4, 0.0, 1.0)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -67,7 +73,7 @@ def export_bag(
         "odometry": export.odometry,
         "tf": export.tf,
         "imu": export.imu,
-        "images": lambda: export.images(IMAGES, "image_raw"),
+        "images": lambda: export.images(_IMAGES, "image_raw"),
         "depth": lambda: export.images(_DEPTH, "depth"),
         "clouds": export.clouds,
     }
@@ -80,20 +86,47 @@ def export_bag(
         )
     if not streams:
         raise UserError(f"the mission has none of {', '.join(contents)}: choose by --bag_content")
-    total = sum(stream.count for stream in streams)
-    messages = bag_writing.watched(
-        bag_writing.in_order(*(stream.messages for stream in streams)), total, progress
-    )
-    counts = bag_writing.write_bag(path, kind, messages, overwrite=overwrite)
-    return BagReport(
-        bag=path,
-        format=kind.value,
-        missions=(queries.mission_labels(vi_map)[mission],),
-        messages=total,
-        copied_messages=0,
-        topics=written_topics(counts),
-        notes=tuple(export.notes),
-    )
+    labels = (queries.mission_labels(vi_map)[mission],)
+    report = _write(path, kind, streams, labels, overwrite=overwrite, progress=progress)
+    return dataclasses.replace(report, notes=tuple(export.notes))
+
+
+def export_mcap(
+    vi_map: VIMap,
+    map_folder: Path,
+    path: Path,
+    *,
+    images: bool = True,
+    overwrite: bool = False,
+    progress: Progress = SILENT,
+) -> BagReport:
+    """Write paths, poses, landmarks, loop closures and images of all missions as a ROS 2 recording.
+
+    Landmarks, closures and paths have the time of the first vertex, so that they are there at once.
+
+    Args:
+        map_folder: Folder of the map, where its images are.
+        path: Folder to write; it has an .mcap of the same name.
+        images: Write the images among the resources, too.
+        overwrite: Replace a recording that exists.
+
+    Raises:
+        UserError: The map has no vertices, or the recording cannot be written.
+        MapError: An image is missing or damaged.
+    """
+    if not len(vi_map.vertices):
+        raise UserError("the map has no vertices: there is nothing to show")
+    kind, labels = bag_writing.BagFormat.MCAP, tuple(queries.mission_labels(vi_map))
+    bag_writing.check_bag_writable(path, kind, overwrite=overwrite)
+    maker = sensor_messages.MessageMaker(is_ros_2=True)
+    begin_ns = vi_map.vertices.timestamp_ns.min(keepdims=True)
+    streams = [*_landmarks(vi_map, maker, begin_ns), *_closures(vi_map, maker, begin_ns)]
+    for mission, label in enumerate(labels):
+        streams += _mission(vi_map, maker, mission, label, begin_ns)
+        if images:
+            parts = MissionStreams(vi_map, map_folder, mission, kind, BagExportOptions())
+            streams += [s for s in parts.images(_IMAGES, "image_raw") if s.count]
+    return _write(path, kind, streams, labels, overwrite=overwrite, progress=progress)
 
 
 class MissionStreams:
@@ -127,7 +160,7 @@ class MissionStreams:
             self._options.world_frame,
             is_ros_2=self._is_ros_2,
         )
-        return [self._fixed("/pose", "geometry_msgs/msg/PoseStamped", self._times_ns, rows)]
+        return [_stream("/pose", _POSE, self._times_ns, rows)]
 
     def path(self) -> list[MessageStream]:
         """All poses T_G_I in a message, at the last time."""
@@ -135,7 +168,7 @@ class MissionStreams:
             return []
         T_G_I = self._map.T_G_I[self._vertices]
         row = self._maker.path(self._times_ns, T_G_I, self._options.world_frame)
-        return [self._fixed("/path", sensor_messages.PATH, self._times_ns[-1:], [row])]
+        return [_stream("/path", sensor_messages.PATH, self._times_ns[-1:], [row])]
 
     def odometry(self) -> list[MessageStream]:
         """Poses T_M_I with velocities."""
@@ -147,7 +180,7 @@ class MissionStreams:
             (self._options.odom_frame, self._options.base_frame),
             is_ros_2=self._is_ros_2,
         )
-        return [self._fixed("/odometry", "nav_msgs/msg/Odometry", self._times_ns, rows)]
+        return [_stream("/odometry", "nav_msgs/msg/Odometry", self._times_ns, rows)]
 
     def tf(self) -> list[MessageStream]:
         """The tree G, M, I and cameras at the time of each vertex."""
@@ -163,7 +196,7 @@ class MissionStreams:
             T_I_C = self._map.sensors.T_I_S(self._imu_id, self._cameras[camera].id)
             tree.append((_repeated(T_I_C, count), (names.base_frame, f"cam{camera}")))
         rows = bag_layouts.tf_messages(self._times_ns, tree, is_ros_2=self._is_ros_2)
-        return [self._fixed(TF_TOPIC, TF_TYPE, self._times_ns, rows)]
+        return [_stream(TF_TOPIC, TF_TYPE, self._times_ns, rows)]
 
     def imu(self) -> list[MessageStream]:
         """IMU samples, each once."""
@@ -176,7 +209,7 @@ class MissionStreams:
             times_ns, samples, self._options.base_frame, is_ros_2=self._is_ros_2
         )
         topic = _absolute(self._map.sensors.imu(self._imu_id).topic or "imu0")
-        return [self._fixed(topic, "sensor_msgs/msg/Imu", times_ns, messages)]
+        return [_stream(topic, "sensor_msgs/msg/Imu", times_ns, messages)]
 
     def images(self, kinds: tuple[int, ...], name: str) -> list[MessageStream]:
         """Images of frames, of some types of resources, and the calibration of their cameras."""
@@ -190,18 +223,15 @@ class MissionStreams:
             times_ns = vi_map.frames.timestamp_ns[frames[of_camera]]
             order = np.argsort(times_ns, kind="stable")
             rows, times_ns = resources[of_camera[order]], times_ns[order]
-            is_raw = kinds == IMAGES
+            is_raw = kinds == _IMAGES
             topic = _absolute((is_raw and camera.topic) or f"cam{index}/{name}")
             stamps = times_ns - camera.time_offset_ns
-            images = self._resource_messages(
-                rows, times_ns, stamps, bag_writing.Channel(topic, sensor_messages.IMAGE), index
-            )
-            streams.append(MessageStream(topic, len(rows), images))
+            images = self._images(rows, stamps, f"cam{index}")
+            streams.append(_stream(topic, sensor_messages.IMAGE, times_ns, images))
             if is_raw and sensor_messages.has_camera_info(camera):
                 info = f"/cam{index}/camera_info"
-                channel = bag_writing.Channel(info, sensor_messages.CAMERA_INFO)
-                infos = self._camera_infos(times_ns, stamps, channel, index)
-                streams.append(MessageStream(info, len(rows), infos))
+                infos = self._camera_infos(stamps, index)
+                streams.append(_stream(info, sensor_messages.CAMERA_INFO, times_ns, infos))
             elif is_raw and len(rows):
                 self.notes.append(f"camera {index} has a model that CameraInfo does not have")
         return streams
@@ -217,42 +247,92 @@ class MissionStreams:
             mine = mine[np.argsort(table.timestamp_ns[mine], kind="stable")]
             sensor = vi_map.sensors.sensors.get(to_hex(sensor_id))
             topic = _absolute(getattr(sensor, "topic", "") or f"points{number}")
-            messages = self._clouds_of(
-                mine, bag_writing.Channel(topic, sensor_messages.CLOUD), f"lidar{number}"
-            )
-            streams.append(MessageStream(topic, len(mine), messages))
+            times_ns = table.timestamp_ns[mine]
+            clouds = self._clouds(mine, times_ns, f"lidar{number}")
+            streams.append(_stream(topic, sensor_messages.CLOUD, times_ns, clouds))
         return streams
 
-    def _clouds_of(
-        self, rows: I64, channel: bag_writing.Channel, frame: str
-    ) -> Iterator[bag_writing.BagMessage]:
-        times = self._map.resources.timestamp_ns[rows]
-        for row, time_ns in zip(rows.tolist(), times.tolist(), strict=True):
+    def _clouds(self, rows: I64, times_ns: I64, frame: str) -> Iterator[bytes]:
+        for row, time_ns in zip(rows.tolist(), times_ns.tolist(), strict=True):
             name = f"resource {to_hex(self._map.resources.id[row])}"
-            cloud = parse_ply(self._store.load(row), name)
-            yield bag_writing.BagMessage(time_ns, channel, self._maker.cloud(time_ns, frame, cloud))
+            yield self._maker.cloud(time_ns, frame, parse_ply(self._store.load(row), name))
 
-    def _resource_messages(
-        self, rows: I64, times_ns: I64, stamps_ns: I64, channel: bag_writing.Channel, camera: int
-    ) -> Iterator[bag_writing.BagMessage]:
-        for row, time_ns, stamp_ns in zip(
-            rows.tolist(), times_ns.tolist(), stamps_ns.tolist(), strict=True
-        ):
-            data = self._maker.image(stamp_ns, f"cam{camera}", self._store.load(row))
-            yield bag_writing.BagMessage(time_ns, channel, data)
+    def _images(self, rows: I64, stamps_ns: I64, frame: str) -> Iterator[bytes]:
+        for row, stamp_ns in zip(rows.tolist(), stamps_ns.tolist(), strict=True):
+            yield self._maker.image(stamp_ns, frame, self._store.load(row))
 
-    def _camera_infos(
-        self, times_ns: I64, stamps_ns: I64, channel: bag_writing.Channel, camera: int
-    ) -> Iterator[bag_writing.BagMessage]:
-        for time_ns, stamp_ns in zip(times_ns.tolist(), stamps_ns.tolist(), strict=True):
-            model = self._cameras[camera]
-            data = self._maker.camera_info(stamp_ns, f"cam{camera}", model)
-            yield bag_writing.BagMessage(time_ns, channel, data)
+    def _camera_infos(self, stamps_ns: I64, camera: int) -> Iterator[bytes]:
+        for stamp_ns in stamps_ns.tolist():
+            yield self._maker.camera_info(stamp_ns, f"cam{camera}", self._cameras[camera])
 
-    def _fixed(self, topic: str, kind: str, times_ns: I64, rows: list[bytes]) -> MessageStream:
-        return MessageStream(
-            topic, len(rows), bag_writing.messages_of_topic(times_ns, topic, kind, rows)
-        )
+
+def _landmarks(
+    vi_map: VIMap, maker: sensor_messages.MessageMaker, time_ns: I64
+) -> list[MessageStream]:
+    """Return the good landmarks as a cloud."""
+    p_G = vi_map.p_G[vi_map.landmarks.quality == LandmarkQuality.GOOD]
+    if not len(p_G):
+        return []
+    cloud = PlyCloud(p_G.astype(np.float32).astype(np.float64))
+    row = maker.cloud(int(time_ns[0]), _FRAME, cloud)
+    return [_stream("/landmarks", sensor_messages.CLOUD, time_ns, [row])]
+
+
+def _closures(
+    vi_map: VIMap, maker: sensor_messages.MessageMaker, time_ns: I64
+) -> list[MessageStream]:
+    """Return the loop closures as lines between their vertices."""
+    edges, p_G_I = vi_map.loop_closure_edges, vi_map.T_G_I[:, 4:]
+    if not len(edges):
+        return []
+    ends: F64 = np.stack([p_G_I[edges.from_vertex], p_G_I[edges.to_vertex]], axis=1)
+    row = maker.lines(int(time_ns[0]), _FRAME, "loop closures", ends, _CLOSURE_COLOUR)
+    return [_stream("/loop_closures", sensor_messages.LINES, time_ns, [row])]
+
+
+def _mission(
+    vi_map: VIMap, maker: sensor_messages.MessageMaker, mission: int, label: str, begin_ns: I64
+) -> list[MessageStream]:
+    """Return the path of a mission, and its poses at their times."""
+    rows = slice(*vi_map.vertex_start[mission : mission + 2].tolist())
+    times_ns, T_G_I = vi_map.vertices.timestamp_ns[rows], vi_map.T_G_I[rows]
+    if not len(times_ns):
+        return []
+    name = "".join(letter if letter.isalnum() else "_" for letter in label)
+    poses = bag_layouts.pose_messages(times_ns, T_G_I, _FRAME, is_ros_2=True)
+    path = maker.path(times_ns, T_G_I, _FRAME)
+    return [
+        _stream(f"/mission_{name}/path", sensor_messages.PATH, begin_ns, [path]),
+        _stream(f"/mission_{name}/pose", _POSE, times_ns, poses),
+    ]
+
+
+def _stream(topic: str, kind: str, times_ns: I64, rows: Iterable[bytes]) -> MessageStream:
+    messages = bag_writing.messages_of_topic(times_ns, topic, kind, rows)
+    return MessageStream(topic, len(times_ns), messages)
+
+
+def _write(
+    path: Path,
+    kind: bag_writing.BagFormat,
+    streams: list[MessageStream],
+    missions: tuple[str, ...],
+    *,
+    overwrite: bool,
+    progress: Progress,
+) -> BagReport:
+    total = sum(stream.count for stream in streams)
+    messages = bag_writing.in_order(*(stream.messages for stream in streams))
+    watched = bag_writing.watched(messages, total, progress)
+    counts = bag_writing.write_bag(path, kind, watched, overwrite=overwrite)
+    return BagReport(
+        bag=path,
+        format=kind.value,
+        missions=missions,
+        messages=total,
+        copied_messages=0,
+        topics=written_topics(counts),
+    )
 
 
 def _repeated(T_A_B: F64, count: int) -> F64:

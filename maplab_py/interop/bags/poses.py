@@ -152,18 +152,10 @@ def _added(
         tree = [(T_G_M, (world, odom)), (T_M_I, (odom, base))]
         rows = bag_layouts.tf_messages(poses.times_ns, tree, is_ros_2=kind.is_ros_2)
         streams.append((TF_TOPIC, TF_TYPE, rows))
-    times = poses.times_ns.tolist()
     return [
-        _in_channel(times, present.get((topic, type_), bag_writing.Channel(topic, type_)), rows)
+        bag_writing.messages_of_topic(poses.times_ns, topic, type_, rows, present)
         for topic, type_, rows in streams
     ]
-
-
-def _in_channel(
-    times_ns: list[int], channel: bag_writing.Channel, rows: list[bytes]
-) -> Iterator[bag_writing.BagMessage]:
-    for time_ns, data in zip(times_ns, rows, strict=True):
-        yield bag_writing.BagMessage(time_ns, channel, data)
 
 
 def _check_types(

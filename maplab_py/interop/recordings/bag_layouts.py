@@ -150,8 +150,7 @@ def transform_messages(
 ) -> list[bytes]:
     """Return geometry_msgs/TransformStamped of poses T_A_B (N, 7); the frames are A and B."""
     layout = MessageLayout(is_ros_2=is_ros_2)
-    columns = _add_transform(layout, "", times_ns, T_A_B, frames, is_ros_2=is_ros_2)
-    return layout.filled(len(times_ns), **columns)
+    return _transforms(layout, times_ns, [(T_A_B, frames)], is_ros_2=is_ros_2)
 
 
 def tf_messages(
@@ -166,10 +165,7 @@ def tf_messages(
     """
     layout = MessageLayout(is_ros_2=is_ros_2)
     layout.constant("<u4", len(transforms))
-    columns: dict[str, ArrayLike] = {}
-    for row, (T_A_B, frames) in enumerate(transforms):
-        columns |= _add_transform(layout, f"{row}_", times_ns, T_A_B, frames, is_ros_2=is_ros_2)
-    return layout.filled(len(times_ns), **columns)
+    return _transforms(layout, times_ns, transforms, is_ros_2=is_ros_2)
 
 
 def odometry_messages(
@@ -218,22 +214,20 @@ def odometry_messages(
     )
 
 
-def _add_transform(
+def _transforms(
     layout: MessageLayout,
-    prefix: str,
     times_ns: I64,
-    T_A_B: F64,
-    frames: tuple[str, str],
+    transforms: list[tuple[F64, tuple[str, str]]],
     *,
     is_ros_2: bool,
-) -> dict[str, ArrayLike]:
-    """Append a TransformStamped to a layout; return its columns."""
-    layout.header(f"{prefix}stamp", frames[0])
-    layout.text(frames[1])
-    layout.values(f"{prefix}p", "<f8", 3)
-    layout.values(f"{prefix}q", "<f8", 4)
-    return {
-        f"{prefix}p": T_A_B[:, 4:],
-        f"{prefix}q": T_A_B[:, :4],
-        **stamp_columns(f"{prefix}stamp", times_ns, is_ros_2=is_ros_2),
-    }
+) -> list[bytes]:
+    """Append TransformStamped to a layout; return its messages."""
+    columns: dict[str, ArrayLike] = {}
+    for row, (T_A_B, (frame_A, frame_B)) in enumerate(transforms):
+        layout.header(f"{row}_stamp", frame_A)
+        layout.text(frame_B)
+        layout.values(f"{row}_p", "<f8", 3)
+        layout.values(f"{row}_q", "<f8", 4)
+        columns |= {f"{row}_p": T_A_B[:, 4:], f"{row}_q": T_A_B[:, :4]}
+        columns |= stamp_columns(f"{row}_stamp", times_ns, is_ros_2=is_ros_2)
+    return layout.filled(len(times_ns), **columns)

@@ -6,11 +6,12 @@ import heapq
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from enum import Enum
 from functools import partial
 from itertools import repeat
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from maplab_py.array_types import I64
@@ -94,10 +95,18 @@ def format_of_bag(path: Path) -> BagFormat:
 
 
 def messages_of_topic(
-    times_ns: I64, topic: str, kind: str, rows: Sequence[bytes]
+    times_ns: I64,
+    topic: str,
+    kind: str,
+    rows: Iterable[bytes],
+    channels: Mapping[tuple[str, str], Channel] = MappingProxyType({}),
 ) -> Iterator[BagMessage]:
-    """Yield serialised standard messages of a topic, each arriving at its time (N,)."""
-    return map(BagMessage, times_ns.tolist(), repeat(Channel(topic, kind)), rows)
+    """Yield serialised messages of a topic, each arriving at its time (N,).
+
+    They are standard messages unless their topic and type have a channel already.
+    """
+    channel = channels.get((topic, kind), Channel(topic, kind))
+    return map(BagMessage, times_ns.tolist(), repeat(channel), rows)
 
 
 def messages_of_bag(

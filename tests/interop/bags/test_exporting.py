@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from maplab_py.cancellation import CancelToken, obeying
 from maplab_py.errors import Cancelled, FlagError, MapError, UserError
 from maplab_py.geometry import se3
-from maplab_py.interop.bags import listing, map_scene, sensor_messages
-from maplab_py.interop.bags.exporting import export_bag
+from maplab_py.interop.bags import listing, sensor_messages
+from maplab_py.interop.bags.exporting import export_bag, export_mcap
 from maplab_py.interop.bags.options import BagExportOptions, PoseToBagOptions
 from maplab_py.interop.bags.poses import add_poses_to_bag, pose_times
 from maplab_py.interop.recordings import bag_layouts, bag_writing, map_replay, reader_choice, stream
@@ -345,7 +345,7 @@ def test_poses_landmarks_closures_and_images_read_back(tmp_path: Path) -> None:
     vi_map = vi_map.replace(
         landmarks=landmarks.replace(quality=quality), loop_closure_edges=closure
     )
-    report = map_scene.export_mcap(vi_map, tmp_path, tmp_path / "scene")
+    report = export_mcap(vi_map, tmp_path, tmp_path / "scene")
     assert (tmp_path / "scene" / "scene.mcap").is_file()
     read = small_bags.messages_of(tmp_path / "scene")
     assert {topic.topic: topic.messages for topic in report.topics} == {
@@ -372,10 +372,10 @@ def _position(pose: object) -> list[float]:
 
 def test_images_are_left_out_on_request(tmp_path: Path) -> None:
     vi_map = small_bags.map_with_resources()[0]
-    report = map_scene.export_mcap(vi_map, tmp_path, tmp_path / "scene", images=False)
+    report = export_mcap(vi_map, tmp_path, tmp_path / "scene", images=False)
     assert not any("image" in topic.topic for topic in report.topics)
 
 
 def test_an_empty_map_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no vertices: there is nothing to show"):
-        map_scene.export_mcap(VIMap(), tmp_path, tmp_path / "scene")
+        export_mcap(VIMap(), tmp_path, tmp_path / "scene")
