@@ -1,4 +1,8 @@
-"""The panel beside the scene: checkboxes, legend, facts, slider."""
+"""The panel beside the scene: checkboxes, legend, facts, slider.
+
+The undo history of the map is a slider in it, with the errors of the map's states; above the layers may be a
+motion that is asked of the person who carries the device: an arrow, and a bar that fills.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +11,7 @@ from functools import partial
 from html import escape
 from typing import TYPE_CHECKING, Any
 
+from maplab_py.viewer import building, history
 from maplab_py.viewer.colours import HIDDEN, from_hex
 from maplab_py.viewer.display import camera, parts
 from maplab_py.viewer.facts import Facts
@@ -15,6 +20,7 @@ from maplab_py.viewer.options import COLOURINGS, VisualizationOptions
 from maplab_py.viewer.scene import Layer, LegendEntry, MissionEntry, Scene
 
 if TYPE_CHECKING:
+    from maplab_py.online_calibration.suggestions import Motion
     from maplab_py.viewer.display.viewer import Viewer
 
 MAX_SWITCHES = 24
@@ -25,6 +31,28 @@ MAX_LAYERS = 9
 
 _ALL = "all missions"
 _ANY = "any reason"
+_DEVICE = (
+    '<rect x="-26" y="-17" width="52" height="34" rx="5" fill="none" stroke="currentColor" '
+    'stroke-width="2.5"/><circle r="9" fill="none" stroke="currentColor" stroke-width="2.5"/>'
+)
+"""The camera as it is seen by the person who holds it; it looks away from them."""
+_TURNS = (
+    "M44 -30 C62 -14 62 14 44 30",  # up and down, about x
+    "M-34 30 C-16 46 16 46 34 30",  # left and right, about y
+    "M-42 8 A43 43 0 1 1 42 8",  # like a steering wheel, about z
+)
+_MOVES = (
+    ("M-34 0 H-72", "M34 0 H72"),
+    ("M0 -25 V-54", "M0 25 V54"),
+    ("M-30 21 L-62 46", "M30 -21 L62 -46"),
+)
+"""Paths along x (right), y (down) and z (away) of the camera."""
+_WALL = (
+    '<rect x="-94" y="-64" width="188" height="128" fill="none" stroke="currentColor" '
+    'stroke-width="3" stroke-dasharray="7 6"/>'
+)
+_NEAR_M = 1.0
+"""Motions as close as this to a wall show it."""
 
 
 class Panel:
@@ -190,6 +218,86 @@ class Panel:
             self._mission_widgets.append(button)
 
 
+class TimeMachine:
+    """The slider of the history; it is there when the map has more than one state."""
+
+    def __init__(self, viewer: Viewer) -> None:
+        """Make the widgets."""
+        self._lock, gui = viewer.lock, viewer.server.gui
+        self._folder = gui.add_folder("History", order=1.5, visible=False)
+        with self._folder:
+            self.slider: Any = gui.add_slider(
+                "state", 0, 1, 1, 1, hint="the map before and after each command"
+            )
+            self.swipe: Any = gui.add_checkbox(
+                "swipe line", False, hint="the state left of a line, the map right of it"
+            )
+            self.chart = gui.add_html("")
+        show = viewer.by_user(lambda _: viewer.set_state(int(self.slider.value)))
+        self.swipe.on_update(show)
+        self.slider.on_update(show)
+        self._is_stopped = False
+        self._subject: building.Subject | None = None
+        self._curves: tuple[history.Curve, ...] = ()
+        self._measured: building.Subject | None = None  # that the curves belong to
+
+    @property
+    def swipes(self) -> bool:
+        """Tell whether states are shown left of a swipe line."""
+        return bool(self.swipe.value)
+
+    def show(self, subject: building.Subject) -> None:
+        """Show the history of a subject, with the curves that are known of it."""
+        self._subject = subject
+        states = subject.history
+        parts.update(self._folder, visible=len(states) > 1)
+        if len(states) < 2:
+            return
+        is_swiped = subject.other is not None and subject.arrangement == "swipe"
+        parts.update(self.swipe, value=is_swiped)
+        parts.update(self.slider, max=len(states) - 1)
+        place = subject.place
+        if place < 0:  # another map is left of the swipe line
+            place = max(subject.replace(other=None).place, 0)
+        parts.update(self.slider, value=place)
+        is_known = self._measured is not None and self._measured.history is states
+        self.chart.content = history.history_chart(states, self._curves if is_known else (), place)
+
+    def stop(self) -> None:
+        """Change nothing any more: the server is about to stop."""
+        self._is_stopped = True
+
+    def measure(self) -> None:
+        """Compute the curves of what is shown, unless they are known: this takes a moment in large maps."""
+        subject = self._subject
+        if subject is None or len(subject.history) < 2:
+            return
+        if self._measured is not None and self._measured.history is subject.history:
+            return
+        curves = history.error_curves(subject.history, subject.truth)
+        with self._lock:
+            if self._is_stopped:
+                return
+            self._curves, self._measured = curves, subject
+            if self._subject is not None:
+                self.show(self._subject)
+
+
+class MotionRequest:
+    """Place above the layers that asks for the motion which a calibration lacks."""
+
+    def __init__(self, viewer: Viewer) -> None:
+        """Ask for nothing."""
+        self._lock = viewer.lock
+        self._html = viewer.server.gui.add_html("", order=0.5, visible=False)
+
+    def show(self, words: str, known_share: float) -> None:
+        """Show a motion, or that none is missing, in all pages; see `_motion_card`."""
+        with self._lock:
+            self._html.content = _motion_card(words, known_share)
+            self._html.visible = True
+
+
 def _switch_colour(mission: MissionEntry, *, is_shown: bool) -> tuple[int, int, int]:
     """Return the colour of a mission's button."""
     red, green, blue = (from_hex(mission.colour)[0] if is_shown else HIDDEN).tolist()
@@ -301,3 +409,40 @@ def small(html: str) -> str:
 def hint(text: str) -> str:
     """Return a quiet line."""
     return f"<div style='{_SMALL}{_PADDED}opacity:0.6'>{escape(text)}</div>"
+
+
+def _motion_card(words: str, known_share: float) -> str:
+    """Return HTML: arrows of a motion about or along the axes of the camera, and how much is known.
+
+    Args:
+        words: Of a motion of `suggestions.MOTIONS`; empty = nothing more is missing.
+        known_share: Part of the calibration's way to the wanted deviations.
+    """
+    from maplab_py.online_calibration.suggestions import MOTIONS
+
+    percent = int(100.0 * min(max(known_share, 0.0), 1.0))
+    bar = (
+        f"<div role='progressbar' aria-label='calibration known' aria-valuenow='{percent}' "
+        "style='height:0.6em;border-radius:0.3em;background:#8886;margin:0.3em 0'><div style='height:100%;"
+        f"width:{percent}%;border-radius:0.3em;background:#1f8a4c'></div></div>"
+    )
+    if not words:
+        return small(f"<b>Calibration known as well as wanted</b>{bar}")
+    arrows = "".join(_arrows(motion) for motion in MOTIONS if motion.words == words)
+    asked = escape(words[0].upper() + words[1:])
+    return small(f"<b>{asked}</b>{arrows}{bar}calibration known: {percent} % of what is wanted")
+
+
+def _arrows(motion: Motion) -> str:
+    paths = [path for path, angle in zip(_TURNS, motion.turn_deg, strict=True) if angle]
+    paths += [p for pair, each in zip(_MOVES, motion.move_m, strict=True) if each for p in pair]
+    tip, both = "marker-end='url(#maplab-tip)'", "marker-start='url(#maplab-tip)'"
+    lines = "".join(f"<path d='{p}' {tip} {both if p in _TURNS else ''}/>" for p in paths)
+    return (
+        f"<svg viewBox='-100 -68 200 136' role='img' aria-label='{escape(motion.words)}' "
+        "style='display:block;width:100%;max-height:8em'><defs><marker id='maplab-tip' viewBox='0 0 8 8' "
+        "refX='5' refY='4' markerWidth='4' markerHeight='4' orient='auto-start-reverse'>"
+        "<path d='M0 0 L8 4 L0 8 z' fill='#d9480f'/></marker></defs>"
+        f"{_WALL if motion.wall_m <= _NEAR_M else ''}{_DEVICE}"
+        f"<g fill='none' stroke='#d9480f' stroke-width='4' stroke-linecap='round'>{lines}</g></svg>"
+    )

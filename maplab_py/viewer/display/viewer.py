@@ -20,8 +20,7 @@ from maplab_py.viewer.building import Subject, make_checked_drawing, scene_of
 from maplab_py.viewer.display.camera import Cameras, aim
 from maplab_py.viewer.display.court import Court
 from maplab_py.viewer.display.links import Links
-from maplab_py.viewer.display.motion import MotionRequest
-from maplab_py.viewer.display.panel import Panel
+from maplab_py.viewer.display.panel import MotionRequest, Panel, TimeMachine
 from maplab_py.viewer.display.parts import Nodes, by_user
 from maplab_py.viewer.display.picture import (
     export_html,
@@ -32,9 +31,7 @@ from maplab_py.viewer.display.picture import (
 from maplab_py.viewer.display.playback_control import Playback
 from maplab_py.viewer.display.player import Player
 from maplab_py.viewer.display.selection import Selection, Selections, fly
-from maplab_py.viewer.display.server import LOOPBACK, start_server
-from maplab_py.viewer.display.themes import Themes
-from maplab_py.viewer.display.time_machine import TimeMachine
+from maplab_py.viewer.display.server import LOOPBACK, Themes, start_server
 from maplab_py.viewer.drawing import Drawing
 from maplab_py.viewer.layers.closures import REFUSED
 from maplab_py.viewer.options import PlaybackOptions
@@ -84,7 +81,7 @@ class Viewer:
         self._playback = Playback(self)
         self._time_machine = TimeMachine(self)
         self.court = Court(self)
-        self.motion = MotionRequest(self._server, self.lock)
+        self.motion = MotionRequest(self)
         self.links = Links(self, self._panel.view)
         self._themes = Themes(self, self._panel.view, is_dark=is_dark)
         self._drawing: Drawing | None = None
