@@ -31,15 +31,9 @@ from maplab_py.storage.protobuf.ids import ids_of
 from maplab_py.storage.protobuf.scan import MemoryBudget
 from maplab_py.storage.protobuf.tables_from_messages import Content, required_rows, unique_index
 from maplab_py.storage.protobuf.vertex_parts import NO_TIME, JoinedParts, VertexPart
-from maplab_py.vimap import IdIndex, TransformationKind, VIMap, is_valid, starts_of_counts, to_hex
+from maplab_py.vimap import IdIndex, VIMap, is_valid, starts_of_counts, to_hex
 from maplab_py.vimap.number_repair import without_bad_numbers
 from maplab_py.vimap.tables import Frames
-
-_TRANSFORMATIONS = {
-    "odometry": TransformationKind.ODOMETRY,
-    "transformation": TransformationKind.TRANSFORMATION,
-    "wheel_odometry": TransformationKind.WHEEL_ODOMETRY,
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -272,16 +266,11 @@ def _edge_tables(content: Content, kinds: list[str], vertex_index: IdIndex) -> d
     imu_edges, samples = tables_from_messages.read_imu_edges(
         content, _rows_of(kinds, "imu"), vertex_index
     )
-    relative = [k for k, kind in enumerate(kinds) if kind in _TRANSFORMATIONS]
     return {
         "imu_edges": imu_edges,
         "imu_samples": samples,
         "transformation_edges": tables_from_messages.read_transformation_edges(
-            content,
-            relative,
-            [_TRANSFORMATIONS[kinds[k]] for k in relative],
-            [getattr(content.edges[k], kinds[k]) for k in relative],
-            vertex_index,
+            content, kinds, vertex_index
         ),
         "loop_closure_edges": tables_from_messages.read_loop_closures(
             content, _rows_of(kinds, "loop_closure"), vertex_index

@@ -3,12 +3,11 @@
 import re
 from pathlib import Path
 
-import numpy as np
-
 from maplab_py.errors import MapError
 from maplab_py.input_files import read_text
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import HEX_DIGITS, to_hex_list
+from maplab_py.vimap.table import object_column
 
 FILE_NAME = "mission_names.txt"
 MAX_NAME_LENGTH = 60
@@ -72,9 +71,7 @@ def with_folder_names(vi_map: VIMap, folder: Path) -> VIMap:
 
 def named(vi_map: VIMap, names: list[str]) -> VIMap:
     """Return a map with other names of its missions (M)."""
-    column = np.empty(len(names), dtype=object)
-    column[:] = names
-    return vi_map.replace(missions=vi_map.missions.replace(name=column))
+    return vi_map.replace(missions=vi_map.missions.replace(name=object_column(names)))
 
 
 def is_name(text: str) -> bool:

@@ -14,6 +14,7 @@ from maplab_py.storage.protobuf import message_numbers
 from maplab_py.storage.protobuf.ids import ids_of, unknown_bytes
 from maplab_py.storage.protobuf.message_numbers import Name
 from maplab_py.vimap import IdIndex, as_keys, is_valid, tables, to_hex
+from maplab_py.vimap.table import object_column
 
 SENSOR_FIELDS = {
     tables.MissionSensor.NCAMERA: "ncamera_id",
@@ -25,6 +26,12 @@ SENSOR_FIELDS = {
     tables.MissionSensor.DETECTION: "detection_id",
     tables.MissionSensor.WHEEL_ODOMETRY: "wheel_odometry_id",
 }
+TRANSFORMATION_FIELDS = {
+    tables.TransformationKind.ODOMETRY: "odometry",
+    tables.TransformationKind.TRANSFORMATION: "transformation",
+    tables.TransformationKind.WHEEL_ODOMETRY: "wheel_odometry",
+}
+_TRANSFORMATIONS = {field: int(kind) for kind, field in TRANSFORMATION_FIELDS.items()}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -111,7 +118,7 @@ def read_baseframes(content: Content) -> tables.BaseFrames:
             [b.T_G_M_covariance for b in frames], 6, "T_G_M_covariance", name
         ),
         is_known=[b.is_T_G_M_known for b in frames],
-        unknown=_objects([unknown_bytes(b) for b in frames]),
+        unknown=object_column([unknown_bytes(b) for b in frames]),
     )
 
 
@@ -146,7 +153,7 @@ def read_missions(
             [m.backbone for m in missions], len(tables.Backbone), "backbone", name
         ),
         sensor_id=sensor_id,
-        unknown=_objects([unknown_bytes(m) for m in missions]),
+        unknown=object_column([unknown_bytes(m) for m in missions]),
     )
 
 
@@ -163,7 +170,7 @@ def read_vertices(vertices: list[Any], ids: U64, timestamp_ns: I64, name: Name) 
         gyro_bias=_vectors([v.gyro_bias for v in vertices], "gyro_bias", name),
         timestamp_ns=timestamp_ns,
         nframe_id=ids_of([v.nframe.id for v in vertices], "id of the n-frame", name),
-        unknown=_objects([unknown_bytes(v) for v in vertices]),
+        unknown=object_column([unknown_bytes(v) for v in vertices]),
     )
 
 
@@ -183,7 +190,7 @@ def read_absolute_poses(vertices: list[Any], vertex_name: Name) -> tables.Absolu
         covariance=message_numbers.covariances(
             [m.covariance for _, m in owned], 6, "the covariance of an absolute pose", name
         ),
-        unknown=_objects([unknown_bytes(m) for _, m in owned]),
+        unknown=object_column([unknown_bytes(m) for _, m in owned]),
     )
 
 
@@ -210,7 +217,7 @@ def read_imu_edges(
         from_vertex=first[order],
         to_vertex=second[order],
         sample_count=counts,
-        unknown=_objects([unknown_bytes(e) for e in edges]),
+        unknown=object_column([unknown_bytes(e) for e in edges]),
     )
     times = [np.array(e.timestamps_ns, dtype=np.int64) for e in edges]
     data = [np.array(e.accel_gyro, dtype=np.float64) for e in edges]
@@ -224,19 +231,17 @@ def read_imu_edges(
 
 
 def read_transformation_edges(
-    content: Content,
-    rows: list[int],
-    kinds: list[tables.TransformationKind],
-    edges: list[Any],
-    vertex_rows: IdIndex,
+    content: Content, kinds: list[str], vertex_rows: IdIndex
 ) -> tables.TransformationEdges:
-    """Return relative-pose edges (rows in file order), sorted by their first vertex."""
+    """Return relative-pose edges, sorted by their first vertex; `kinds` are those of all edges."""
+    rows = [k for k, kind in enumerate(kinds) if kind in _TRANSFORMATIONS]
+    edges = [getattr(content.edges[k], kinds[k]) for k in rows]
     name = content.namer("edges", rows)
     first, second = _ends(edges, vertex_rows, name)
     table = tables.TransformationEdges.filled(
         len(edges),
         id=content.edge_ids[rows],
-        kind=[int(kind) for kind in kinds],
+        kind=[_TRANSFORMATIONS[kinds[k]] for k in rows],
         from_vertex=first,
         to_vertex=second,
         T_A_B=message_numbers.poses([e.T_A_B for e in edges], "T_A_B", name),
@@ -244,7 +249,7 @@ def read_transformation_edges(
             [e.covariance for e in edges], 6, "T_A_B_covariance", name
         ),
         sensor_id=ids_of([e.sensor_id for e in edges], "sensor", name),
-        unknown=_objects([unknown_bytes(e) for e in edges]),
+        unknown=object_column([unknown_bytes(e) for e in edges]),
     )
     return table.take(np.lexsort((second, first, table.kind)))
 
@@ -269,7 +274,7 @@ def read_loop_closures(
             e.switch_variable if e.HasField("switch_variable") else 1.0 for e in edges
         ],
         switch_variable_variance=[e.switch_variable_variance for e in edges],
-        unknown=_objects([unknown_bytes(e) for e in edges]),
+        unknown=object_column([unknown_bytes(e) for e in edges]),
     )
 
 
@@ -284,10 +289,3 @@ def _ends(edges: list[Any], vertex_rows: IdIndex, name: Name) -> tuple[I64, I64]
 
 def _vectors(fields: list[Any], where: str, name: Name) -> NDArray[np.float64]:
     return message_numbers.finite(message_numbers.rows_or(fields, 3, 0.0, where, name), where, name)
-
-
-def _objects(values: list[Any]) -> NDArray[Any]:
-    """Make a column of objects (bytes of unknown fields)."""
-    column = np.empty(len(values), dtype=object)
-    column[:] = values
-    return column

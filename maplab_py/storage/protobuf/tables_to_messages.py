@@ -10,7 +10,7 @@ from maplab_py.array_types import U64, NDArray
 from maplab_py.storage import maplab_map_pb2 as pb
 from maplab_py.storage.protobuf import file_contents
 from maplab_py.storage.protobuf.map_files import FileKind
-from maplab_py.storage.protobuf.tables_from_messages import SENSOR_FIELDS
+from maplab_py.storage.protobuf.tables_from_messages import SENSOR_FIELDS, TRANSFORMATION_FIELDS
 from maplab_py.storage.protobuf.vertices_to_messages import id_rows, tag_of, vertices_to_bytes
 from maplab_py.vimap import ResourceOwner, TransformationKind, VIMap, is_valid, ragged_rows
 
@@ -125,11 +125,6 @@ def resource_info(vi_map: VIMap) -> pb.ResourceInfoMap:
     return message
 
 
-_FIELDS = {
-    TransformationKind.ODOMETRY: "odometry",
-    TransformationKind.TRANSFORMATION: "transformation",
-    TransformationKind.WHEEL_ODOMETRY: "wheel_odometry",
-}
 _TRANSFORMATIONS = ("kind", "T_A_B", "covariance", "sensor_id", "unknown")
 _LOOP_CLOSURES = (
     "T_A_B",
@@ -232,7 +227,9 @@ def _add_transformations(message: pb.VIMap, columns: file_contents.Columns) -> N
     ends = _Ends(message, columns, "relative")
     sensor_words = file_contents.words(columns["relative.sensor_id"])
     for row in range(len(ends)):
-        relative = ends.add(row, _FIELDS[TransformationKind(columns["relative.kind"][row])])
+        relative = ends.add(
+            row, TRANSFORMATION_FIELDS[TransformationKind(columns["relative.kind"][row])]
+        )
         relative.T_A_B.extend(columns["relative.T_A_B"][row].tolist())
         file_contents.extend_finite(relative.covariance, columns["relative.covariance"][row])
         relative.sensor_id.words.extend(sensor_words[row])
