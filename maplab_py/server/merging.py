@@ -218,14 +218,16 @@ class Merger:
             return 0.0
         vi_map, _ = evaluate_quality(before, LandmarkQualityOptions())
         vi_map, _, _ = self._anchor(vi_map, progress)
+        options, notes = self._optimization, [""]
         if self._merging.enable_visual_loop_closure:
-            vi_map = self._with_all_loops(vi_map, progress)
-        options, self.note = self._optimization, ""
+            vi_map, notes[0] = self._with_all_loops(vi_map, progress)
         if self._merging.enable_lidar_loop_closure and self._map_folder is not None:
-            vi_map, self.note = alignments.with_cloud_loops(vi_map, self._map_folder, progress)
+            vi_map, note = alignments.with_cloud_loops(vi_map, self._map_folder, progress)
+            notes.append(note)
             options = dataclasses.replace(options, include_loop_closure_edges=True)
         if self.radius > 0.0 and self._merging.preserve_trust_region_radius_across_merging:
             options = dataclasses.replace(options, initial_trust_region_radius=self.radius)
+        self.note = "; ".join(filter(None, notes))
         vi_map, report = optimize(vi_map, options, progress=progress)
         self.vi_map, self.radius = vi_map, report.trust_region_radius
         known = before.baseframes.is_known[before.missions.baseframe][before.vertices.mission]
@@ -381,16 +383,17 @@ class Merger:
         edited, anchored, _ = self._anchor(part.vi_map, progress)
         return (part.written_back(edited) if anchored else whole), anchored
 
-    def _with_all_loops(self, vi_map: VIMap, progress: Progress) -> VIMap:
+    def _with_all_loops(self, vi_map: VIMap, progress: Progress) -> tuple[VIMap, str]:
+        """Close the loops of the whole map; also return why there are none to look for."""
         try:
             closed, report = close_loops(vi_map, self._loops, progress=progress)
             if not _has_large_gap(report.merges_refused):
-                return closed
+                return closed, ""
             edges, _ = find_loop_closures(vi_map, self._loops, progress=progress)
             relaxed, _ = relax(vi_map, RelaxationOptions(), loop_closures=edges, progress=progress)
-            return close_loops(relaxed, self._loops, progress=progress)[0]
-        except EstimationError:  # nothing to recognise places by
-            return vi_map
+            return close_loops(relaxed, self._loops, progress=progress)[0], ""
+        except EstimationError as error:
+            return vi_map, f"no loops were closed: {error}"
 
     def _remember(self, stretch: Stretch, submap: VIMap, frequencies: F64 | None = None) -> None:
         """Make a stretch known to place recognition; its word frequencies (W,) may be given."""

@@ -10,7 +10,7 @@ from maplab_py.algorithms.anchoring.options import AnchoringReport, MissionAlign
 from maplab_py.algorithms.cloud_registration import registration
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
 from maplab_py.algorithms.landmarks.quality import evaluate_quality
-from maplab_py.errors import UserError
+from maplab_py.errors import EstimationError, UserError
 from maplab_py.server import merging, publishing
 from maplab_py.server.alignments import OpenAlignments
 from maplab_py.server.merging import Merger, stretches_of
@@ -100,6 +100,19 @@ def test_a_map_without_clouds_and_a_missing_library_stop_nothing(
     server.restore(without_resources(server.vi_map, server.vi_map.resources.type >= 0), [])
     server.optimize_jointly()
     assert server.note == ""
+
+
+def test_a_joint_optimisation_says_why_no_loops_were_closed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def close_loops(*_: object, **__: object) -> None:
+        raise EstimationError("too few tracks")
+
+    monkeypatch.setattr(merging, "close_loops", close_loops)
+    server = Merger(MergingOptions(), IncrementalOptions())
+    server.restore(simulated(AROUND).maps[0], [])
+    server.optimize_jointly()
+    assert server.note == "no loops were closed: too few tracks"
 
 
 A, B, C, D = (letter * 32 for letter in "abcd")
