@@ -256,31 +256,23 @@ def add_other_sensors(
         UserError: There is no pair of places for the loop closure edges.
     """
     T_G_I, time_ns = recording.motion.T_G_I, recording.time_ns
-    wanted = {
-        tables.MissionSensor.ABSOLUTE_6DOF: options.absolute_pose_every_s > 0.0,
-        tables.MissionSensor.ODOMETRY_6DOF: options.odometry,
-        tables.MissionSensor.WHEEL_ODOMETRY: options.wheel_odometry,
-    }
-    ids = dict(zip(wanted, random_ids(len(wanted), rng), strict=True))
+    pose_id, odometry_id, wheel_id = random_ids(3, rng)
     T_I_S = se3.make(so3.exp(options.sensor_turn_rad), np.asarray(options.sensor_position_m))
-    edges = []
-    for kind in (tables.MissionSensor.ABSOLUTE_6DOF, tables.MissionSensor.ODOMETRY_6DOF):
-        if wanted[kind]:
-            vi_map = with_sensor(vi_map, kind, ids[kind], imu_id, T_I_S)
-    if wanted[tables.MissionSensor.ABSOLUTE_6DOF]:
-        poses = _absolute_poses(
-            T_G_I, T_I_S, time_ns, ids[tables.MissionSensor.ABSOLUTE_6DOF], options, rng
-        )
+    kinds, edges = tables.MissionSensor, []
+    if options.absolute_pose_every_s > 0.0:
+        vi_map = with_sensor(vi_map, kinds.ABSOLUTE_6DOF, pose_id, imu_id, T_I_S)
+        poses = _absolute_poses(T_G_I, T_I_S, time_ns, pose_id, options, rng)
         vi_map = vi_map.replace(absolute_poses=poses)
-    if wanted[tables.MissionSensor.ODOMETRY_6DOF]:
-        sensor = ids[tables.MissionSensor.ODOMETRY_6DOF]
-        edges.append(_odometry(T_G_I, T_I_S, sensor, TransformationKind.ODOMETRY, options, rng))
-    if wanted[tables.MissionSensor.WHEEL_ODOMETRY]:
-        kind, sensor = tables.MissionSensor.WHEEL_ODOMETRY, ids[tables.MissionSensor.WHEEL_ODOMETRY]
-        T_I_W = wheel_mounting(options)
-        vi_map = with_sensor(vi_map, kind, sensor, imu_id, T_I_W)
-        wheel = TransformationKind.WHEEL_ODOMETRY
-        edges.append(_odometry(T_G_I, T_I_W, sensor, wheel, options, rng))
+    for kind, sensor, edge, is_wanted, T_I_O in (
+        (kinds.ODOMETRY_6DOF, odometry_id, TransformationKind.ODOMETRY, options.odometry, T_I_S),
+        (
+            kinds.WHEEL_ODOMETRY, wheel_id, TransformationKind.WHEEL_ODOMETRY,
+            options.wheel_odometry, wheel_mounting(options),
+        ),
+    ):  # fmt: skip
+        if is_wanted:
+            vi_map = with_sensor(vi_map, kind, sensor, imu_id, T_I_O)
+            edges.append(_odometry(T_G_I, T_I_O, sensor, edge, options, rng))
     if edges:
         vi_map = vi_map.replace(transformation_edges=tables.TransformationEdges.concatenate(edges))
     if options.loop_edges == 0:

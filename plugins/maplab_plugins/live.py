@@ -173,13 +173,12 @@ def live_run(
     Raises:
         UserError: There is no calibration, or a topic is missing or of another type.
     """
-    from maplab_py.interop.live.connection import open_transport
-    from maplab_py.interop.live.publishing import PosePublisher
+    from maplab_py.interop.live import connection, publishing
     from maplab_py.interop.live.source import LiveRecording
     from maplab_py.interop.recordings.reader_choice import given_device
 
     device = given_device(source, f"--datasource_type={kind}: a live source")
-    with open_transport(kind, network) as transport:
+    with connection.open_transport(kind, network) as transport:
         recording = LiveRecording(
             transport,
             device,
@@ -189,5 +188,5 @@ def live_run(
             tolerance_ns=stream.nframe_sync_tolerance_ns,
             tell=context.progress.line,
         )
-        publisher = PosePublisher(transport, live) if live.publish else None
+        publisher = publishing.PosePublisher(transport, live) if live.publish else None
         yield LiveRun(recording, publisher)

@@ -291,11 +291,10 @@ def remove_loopclosure(
         closures: Beginnings of the closures' ids as lc_report shows them, separated by commas.
         neighbors_s: Also remove accepted closures both of whose ends are within this time.
     """
-    from maplab_py.algorithms.loop_closure.listing import find_closures
-    from maplab_py.algorithms.loop_closure.record_updates import remove_closures
+    from maplab_py.algorithms.loop_closure import listing, record_updates
 
-    ids = find_closures(context.vi_map, closures.split(","), neighbours_s=neighbors_s)
-    return context.apply(remove_closures, ids)
+    ids = listing.find_closures(context.vi_map, closures.split(","), neighbours_s=neighbors_s)
+    return context.apply(record_updates.remove_closures, ids)
 
 
 @command(

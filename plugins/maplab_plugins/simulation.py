@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 from maplab_py.plugin import CommandContext, EstimationError, UserError, command
 
 if TYPE_CHECKING:
-    from maplab_py.simulation.evaluation import MapErrors
-    from maplab_py.simulation.reports import DemoReport, ScenarioList, SimulatedMaps
+    from maplab_py.simulation import evaluation, reports
     from maplab_py.simulation.scenario import Scenario
     from maplab_py.simulation.simulate import SimulatedData
     from maplab_py.vimap import VIMap
@@ -21,7 +20,7 @@ _DEFAULT_SCENARIO = "three_sessions"
 
 
 @command("list_scenarios", needs_map=False, see_also=("simulate",))
-def list_scenarios(context: CommandContext) -> ScenarioList:  # noqa: ARG001
+def list_scenarios(context: CommandContext) -> reports.ScenarioList:  # noqa: ARG001
     """List the scenarios that `simulate` knows by name."""
     from maplab_py.simulation.scenario_file import list_scenarios as listed
 
@@ -44,7 +43,7 @@ def simulate(
     seed: int | None = None,
     raw_data: bool = False,
     overwrite: bool = False,
-) -> SimulatedMaps:
+) -> reports.SimulatedMaps:
     """Simulate sessions with known truth and write one map per session.
 
     Args:
@@ -70,7 +69,7 @@ def simulate(
     see_also=("simulate",),
     reads=("truth",),
 )
-def evaluate_map(context: CommandContext, *, truth: Path) -> MapErrors:
+def evaluate_map(context: CommandContext, *, truth: Path) -> evaluation.MapErrors:
     """Compare the selected map with the truth of its simulation.
 
     Args:
@@ -96,7 +95,7 @@ def demo(
     map_folder: Path = Path("maplab_demo"),
     seed: int = 1,
     overwrite: bool = False,
-) -> DemoReport:
+) -> reports.DemoReport:
     """Simulate three drifting sessions, merge them by the usual commands, compare with the truth.
 
     Args:

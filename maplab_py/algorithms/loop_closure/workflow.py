@@ -5,10 +5,9 @@ import dataclasses
 import numpy as np
 
 from maplab_py.algorithms.landmarks.quality import evaluate_unknown_quality
-from maplab_py.algorithms.loop_closure import merging
+from maplab_py.algorithms.loop_closure import features, merging
 from maplab_py.algorithms.loop_closure.closure_table import Closures, closure_edges
 from maplab_py.algorithms.loop_closure.detection import Detection, detect
-from maplab_py.algorithms.loop_closure.features import SearchScope
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.record_updates import with_closures
 from maplab_py.algorithms.loop_closure.reports import GAP, LoopClosureReport
@@ -19,7 +18,7 @@ from maplab_py.report import counted
 from maplab_py.vimap import IdIndex, LoopClosureEdges, VIMap, to_hex
 
 _DEFAULT = LoopClosureOptions()
-_EVERYTHING = SearchScope()
+_EVERYTHING = features.SearchScope()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -35,7 +34,7 @@ def close_loops(
     options: LoopClosureOptions = _DEFAULT,
     *,
     missions: I64 | None = None,
-    scope: SearchScope = _EVERYTHING,
+    scope: features.SearchScope = _EVERYTHING,
     progress: Progress = SILENT,
 ) -> tuple[VIMap, LoopClosureReport]:
     """Find loop closures and merge landmarks of the same point.
@@ -146,7 +145,7 @@ def _detect(
     options: LoopClosureOptions,
     missions: I64 | None,
     progress: Progress,
-    scope: SearchScope = _EVERYTHING,
+    scope: features.SearchScope = _EVERYTHING,
 ) -> Detection:
     rows = np.arange(len(vi_map.missions)) if missions is None else missions
     return detect(

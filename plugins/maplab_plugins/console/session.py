@@ -102,14 +102,12 @@ def check(context: CommandContext, script: Path) -> Plan:
     Args:
         script: File of commands.
     """
-    from maplab_py.console.scripts.batch import read_script
-    from maplab_py.console.scripts.checking import check_script
-    from maplab_py.console.scripts.costs import predict
+    from maplab_py.console.scripts import batch, checking, costs
 
-    problems, steps = check_script(read_script(script), context.session)
+    problems, steps = checking.check_script(batch.read_script(script), context.session)
     if problems:
         raise UserError("; ".join(f"{script}: {problem}" for problem in problems))
-    return predict(steps, context.maps)
+    return costs.predict(steps, context.maps)
 
 
 @command("fix", see_also=("undo",), needs_map=False, acts_outside=True)

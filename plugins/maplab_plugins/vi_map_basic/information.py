@@ -25,8 +25,7 @@ if TYPE_CHECKING:
     )
     from maplab_py.algorithms.map_health import MapHealth
     from maplab_py.console.session.session import Session
-    from maplab_py.vimap import VIMap
-    from maplab_py.vimap.consistency import ConsistencyReport
+    from maplab_py.vimap import VIMap, consistency
     from maplab_py.vimap.ids import IdArray
     from maplab_py.vimap.statistics import CoobservabilityReport, MapDetails, MapStatistics
 
@@ -151,7 +150,7 @@ def print_camera_calibrations(context: CommandContext) -> CameraList:
 
 
 @command("check_map_consistency")
-def check_map_consistency(context: CommandContext) -> ConsistencyReport:
+def check_map_consistency(context: CommandContext) -> consistency.ConsistencyReport:
     """Check the consistency of the map; fails if a rule is violated.
 
     Resources whose files are missing are errors. Files in the map's resource folder that no resource
@@ -245,8 +244,7 @@ def memory(context: CommandContext, *, undo: UndoOptions = UndoOptions()) -> Mem
     from maplab_py.console.session.maps import bounded, former_values
     from maplab_py.console.session.settings import Layer
     from maplab_py.memory import available_bytes, resident_bytes
-    from maplab_py.storage.cache.column_file import mapped_bytes
-    from maplab_py.storage.cache.map_cache import MapCache
+    from maplab_py.storage.cache import column_file, map_cache
     from maplab_py.vimap.memory_use import SharedColumns
 
     settings = context.session.settings
@@ -261,13 +259,13 @@ def memory(context: CommandContext, *, undo: UndoOptions = UndoOptions()) -> Mem
             MapMemory(
                 map_key=kept.key,
                 columns_gb=_GB * columns.add(kept.vi_map),
-                mapped_gb=_GB * mapped.add(kept.vi_map, mapped_bytes),
+                mapped_gb=_GB * mapped.add(kept.vi_map, column_file.mapped_bytes),
                 undo_values=len(values),
                 undo_gb=_GB * columns.add_all(values),
                 dropped_values=kept.dropped_values,
             )
         )
-    cache = MapCache()
+    cache = map_cache.MapCache()
     use = cache.use()
     return MemoryReport(
         maps=tuple(lines),

@@ -139,20 +139,19 @@ def load(
         map_key: Key of the map in memory; empty = the folder's name.
         assign_new_ids: Give missions, vertices, landmarks and edges new ids.
     """
-    from maplab_py.storage.mission_names import with_folder_names
-    from maplab_py.storage.native import disk_copy, load_map
+    from maplab_py.storage import mission_names, native
     from maplab_py.vimap.edits import with_new_ids
 
     key = context.maps.check_new_key(map_key or key_of_folder(map_folder))
-    before = disk_copy(map_folder)
-    vi_map, report = load_map(
+    before = native.disk_copy(map_folder)
+    vi_map, report = native.load_map(
         map_folder,
         max_size_megabytes=reading.proto_max_size_megabytes,
         repair=reading.repair,
         progress=context.progress,
         cache=_cache(reading),
     )
-    vi_map = with_folder_names(vi_map, map_folder)
+    vi_map = mission_names.with_folder_names(vi_map, map_folder)
     if assign_new_ids:
         vi_map = with_new_ids(vi_map)
     is_saved = not (assign_new_ids or reading.repair)
@@ -334,8 +333,7 @@ def _merge_all(
     assign_new_ids: bool,
 ) -> MergedMaps:
     """Load folders and merge them into the selected map, or into a new one if a key is given."""
-    from maplab_py.vimap.edits import with_new_ids
-    from maplab_py.vimap.merge import at_folder, merge_maps, without_folder
+    from maplab_py.vimap import edits, merge
 
     loaded = _load_each(context, folders, reading)
     base = None if new_key else context.vi_map
@@ -343,11 +341,11 @@ def _merge_all(
     for (vi_map, _), folder in zip(loaded, folders, strict=True):
         context.progress.check()
         if base is None:
-            base = without_folder(vi_map, folder)
-            base = with_new_ids(base) if assign_new_ids else base
+            base = merge.without_folder(vi_map, folder)
+            base = edits.with_new_ids(base) if assign_new_ids else base
             continue
-        other = at_folder(vi_map, folder)
-        base, report = merge_maps(base, other, assign_new_ids=assign_new_ids)
+        other = merge.at_folder(vi_map, folder)
+        base, report = merge.merge_maps(base, other, assign_new_ids=assign_new_ids)
         details.append(report)
     return _hand_over(context, base, new_key, folders, details)
 

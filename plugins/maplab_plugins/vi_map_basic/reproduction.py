@@ -143,11 +143,10 @@ def _with_path(word: str, paths: Mapping[str, str]) -> str:
 def _result(folder: Path, card: Card, vi_map: VIMap) -> str:
     """Say how a map differs from the one beside its card."""
     from maplab_py.algorithms.evaluation.map_comparison import compare_maps
-    from maplab_py.storage import checksums
-    from maplab_py.storage.native import is_map_folder, load_map
+    from maplab_py.storage import checksums, native
 
-    if not is_map_folder(folder):
+    if not native.is_map_folder(folder):
         return "there is no map beside the card to compare with"
     if checksums.fingerprint(folder) != card.fingerprint:
         return f"{folder} has changed since its card was written: not compared"
-    return compare_maps(vi_map, load_map(folder)[0]).in_words
+    return compare_maps(vi_map, native.load_map(folder)[0]).in_words

@@ -93,16 +93,15 @@ def _show(
     playback: PlaybackOptions | None = None,
 ) -> ViewReport:
     """Load the clouds of a resource type and show them with the map."""
-    from maplab_py.viewer.building import Subject
-    from maplab_py.viewer.resource_clouds import load_clouds
+    from maplab_py.viewer import building, resource_clouds
 
     folder = context.map_folder or Path()
-    loaded = load_clouds(
+    loaded = resource_clouds.load_clouds(
         context.vi_map, folder, name, clouds, missions=missions, progress=context.progress
     )
     if clouds.export_accumulated_pc_to_ply_path:
         _write(loaded, Path(clouds.export_accumulated_pc_to_ply_path))
-    subject = Subject(context.vi_map, context.map_key, options, clouds=loaded)
+    subject = building.Subject(context.vi_map, context.map_key, options, clouds=loaded)
     return show(context, subject, display, playback=playback, plays=playback is not None)
 
 

@@ -47,10 +47,9 @@ visualize_optimized_depth_maps = _player(
 def _show(
     context: CommandContext, name: str, playback: PlaybackOptions, display: ViewerOptions
 ) -> ViewReport:
-    from maplab_py.viewer.building import Subject
-    from maplab_py.viewer.resource_clouds import VertexImages, resource_rows
+    from maplab_py.viewer import building, resource_clouds
 
-    resource_rows(context.vi_map, name)
-    images = VertexImages(context.vi_map, context.map_folder or Path(), name)
-    subject = Subject(context.vi_map, context.map_key)
+    resource_clouds.resource_rows(context.vi_map, name)
+    images = resource_clouds.VertexImages(context.vi_map, context.map_folder or Path(), name)
+    subject = building.Subject(context.vi_map, context.map_key)
     return show(context, subject, display, playback=playback, image_of=images, plays=True)

@@ -78,11 +78,10 @@ def visualize_esdf(
         dense_esdf_slice_height_m: Height of the slice in the global frame; empty = the median height of
             the vertices.
     """
-    from maplab_py.viewer.building import Subject
-    from maplab_py.viewer.mesh_sources import field_slice
+    from maplab_py.viewer import building, mesh_sources
 
     rows = missions.rows(context.vi_map)
     folder = context.map_folder or Path()
-    cloud = field_slice(context.vi_map, folder, rows, dense_esdf_slice_height_m)
-    subject = Subject(context.vi_map, context.map_key, options, clouds=(cloud,))
+    cloud = mesh_sources.field_slice(context.vi_map, folder, rows, dense_esdf_slice_height_m)
+    subject = building.Subject(context.vi_map, context.map_key, options, clouds=(cloud,))
     return show(context, subject, display)
