@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from array import array
 from collections.abc import Callable
+from concurrent.futures import Executor, ThreadPoolExecutor
 from pathlib import Path
 from typing import Protocol
 
@@ -132,14 +133,8 @@ class Mapping:
             zero_ns=self._recording.start_ns, notes=list(self._recording.device.notes)
         )
         try:
-            for event in self.stream:
-                self._keep_pace(event, is_to_end)
-                progress.check()
-                if is_to_end():
-                    self.is_ended_early = True
-                    break
-                for update in self._pushed(event):
-                    self._take(update, progress)
+            with ThreadPoolExecutor(1, "maplab-images") as thread:
+                self._read(thread, progress, is_to_end)
             self.is_ended_early |= is_to_end()  # a live source ends itself
         except Cancelled:
             raise
@@ -163,6 +158,18 @@ class Mapping:
             return
         if self.builder is not None:
             self.builder.calibrate(self.odometry.device.with_cameras(*estimate.cameras()))
+
+    def _read(self, thread: Executor, progress: Progress, is_to_end: Callable[[], bool]) -> None:
+        """Use the events of the recording; images of files, which need not be waited for, early."""
+        is_file = self._recording.end_ns > 0
+        for event in stream.read_ahead(self.stream, thread) if is_file else self.stream:
+            self._keep_pace(event, is_to_end)
+            progress.check()
+            if is_to_end():
+                self.is_ended_early = True
+                break
+            for update in self._pushed(event):
+                self._take(update, progress)
 
     def recalibrate(self, device: protocol.RecordedSensors) -> None:
         """Go on with another calibration, of sensors with other ids; see `Odometry.recalibrate`."""

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from array import array
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Executor, Future
 
 import numpy as np
 
-from maplab_py.errors import MapError, UserError
+from maplab_py.errors import MapError, MaplabError, UserError
+from maplab_py.interop.images import Pixels
 from maplab_py.interop.recordings import protocol
 from maplab_py.interop.recordings.options import StreamOptions
 
@@ -165,6 +168,38 @@ class EventStream:
                 + ": choose another --vio_rosbag_start_s and --vio_rosbag_end_s"
             )
         raise MapError(f"{self._recording.name}: the recording is empty: record it again")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _AheadImage(protocol.CameraImage):
+    """An image that a thread decodes."""
+
+    pixels: Future[Pixels] = dataclasses.field(kw_only=True)
+
+    def decode(self) -> Pixels:
+        """Wait for the pixels; see `ImageData.decode`."""
+        return self.pixels.result()
+
+
+def read_ahead(events: Iterable[protocol.Event], thread: Executor) -> Iterator[protocol.Event]:
+    """Yield the events of a file; the images of the next frame set are decoded while one is used."""
+    waiting: deque[protocol.Event] = deque()
+    try:
+        for event in events:
+            if isinstance(event, protocol.FrameSet):
+                images = tuple(
+                    _AheadImage(**vars(image), pixels=thread.submit(image.decode))
+                    for image in event.images
+                )
+                waiting.append(dataclasses.replace(event, images=images))
+                while len(waiting) > 1:
+                    yield waiting.popleft()
+            else:
+                waiting.append(event)
+    except MaplabError:
+        yield from waiting
+        raise
+    yield from waiting
 
 
 class Synchroniser:

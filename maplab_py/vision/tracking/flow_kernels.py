@@ -6,7 +6,7 @@ of H. Scharr. Every keypoint is followed by itself.
 
 import numpy as np
 
-from maplab_py.compilation import compiled
+from maplab_py.compilation import compiled, prange
 
 _FAST = {"fastmath": {"contract", "nsz", "arcp", "reassoc"}}
 """Sums are formed in several parts at a time."""
@@ -14,6 +14,8 @@ _LANES = 16
 """Rows of a patch are filled up with zeros to a multiple of it, so that whole vectors are computed."""
 _UPRIGHT_RAD = 0.01
 """Up to this turn patches are compared as they are (measured: keypoints drift by 0.3 px at 5 degrees)."""
+_BLOCK = 16
+"""Keypoints that a thread follows at a time."""
 _ITERATIONS, _CONVERGED_PX, _COARSELY_CONVERGED_PX = 20, 0.01, 0.05
 """Steps in pixels of the image itself, and of the levels above, which only find where the next one begins."""
 _MIN_EIGENVALUE = np.float32(0.1)
@@ -22,7 +24,7 @@ _ZERO, _UNITY, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 _MIDDLE, _SIDE = np.float32(10.0 / 32.0), np.float32(3.0 / 32.0)
 
 
-@compiled(**_FAST)
+@compiled(parallel=True, **_FAST)
 def follow_on_level(first, second, border, size, level, turn, uv, there, levels, is_tracked):  # type: ignore[no-untyped-def]
     """Move keypoints to where a level of the second image looks as the first one about them.
 
@@ -40,45 +42,55 @@ def follow_on_level(first, second, border, size, level, turn, uv, there, levels,
     """
     width = -(-size // _LANES) * _LANES
     stride = max(width, -(-(size + 2) // 8) * 8)
-    square = np.zeros((size + 3) * stride, dtype=np.float32)
-    template, du, dv = np.zeros((3, size * stride), dtype=np.float32)
-    half, scale = size // 2, 0.5**level
+    for block in prange(-(-len(uv) // _BLOCK)):
+        square = np.zeros((size + 3) * stride, dtype=np.float32)
+        template = np.zeros(size * stride, dtype=np.float32)
+        du, dv = np.zeros_like(template), np.zeros_like(template)
+        for k in range(block * _BLOCK, min((block + 1) * _BLOCK, len(uv))):
+            is_tracked[k] = False
+            if level <= levels[k]:
+                is_tracked[k] = _follow(
+                    first, second, border, size, level, turn, uv[k], there[k],
+                    (width, stride), square, template, du, dv,
+                )  # fmt: skip
+
+
+@compiled(**_FAST)
+def _follow(  # type: ignore[no-untyped-def]
+    first, second, border, size, level, turn, uv, there, widths, square, template, du, dv
+):
+    """Move one keypoint; return whether it can be followed."""
+    (width, stride), half, scale = widths, size // 2, 0.5**level
     converged_px = _CONVERGED_PX if level == 0 else _COARSELY_CONVERGED_PX
     height_limit, width_limit = second.shape[0] - size - 2.0, second.shape[1] - width - 2.0
-    for k in range(len(uv)):
-        is_tracked[k] = False
-        if level > levels[k]:
-            continue
-        u0, v0 = uv[k, 0] * scale + border, uv[k, 1] * scale + border
-        if not _sample(first, u0, v0, turn, size + 2, stride, square):
-            continue
-        a, b, c = _differentiate(square, size, stride, template, du, dv)
-        determinant, mean, part = a * c - b * b, _HALF * (a + c), _HALF * (a - c)
-        least = mean - np.sqrt(part * part + b * b)
-        if not least > _MIN_EIGENVALUE * np.float32(size * size):
-            continue
-        u, v = there[k, 0] * scale + border - half, there[k, 1] * scale + border - half
-        before_u, before_v = 0.0, 0.0
-        for iteration in range(_ITERATIONS):
-            inside = 0.0 <= u < width_limit and 0.0 <= v < height_limit
-            is_tracked[k] = inside
-            if not inside:
-                break
-            of_u, of_v = _compare(second, u, v, size, (width, stride), template, du, dv)
-            step_u = float((c * of_u - b * of_v) / determinant)
-            step_v = float((a * of_v - b * of_u) / determinant)
-            u += step_u
-            v += step_v
-            if step_u * step_u + step_v * step_v <= converged_px * converged_px:
-                break
-            swings = abs(step_u + before_u) < converged_px and abs(step_v + before_v) < converged_px
-            if iteration > 0 and swings:
-                u -= 0.5 * step_u
-                v -= 0.5 * step_v
-                break
-            before_u, before_v = step_u, step_v
-        if is_tracked[k]:
-            there[k, 0], there[k, 1] = (u + half - border) / scale, (v + half - border) / scale
+    u0, v0 = uv[0] * scale + border, uv[1] * scale + border
+    if not _sample(first, u0, v0, turn, size + 2, stride, square):
+        return False
+    a, b, c = _differentiate(square, size, stride, template, du, dv)
+    determinant, mean, part = a * c - b * b, _HALF * (a + c), _HALF * (a - c)
+    least = mean - np.sqrt(part * part + b * b)
+    if not least > _MIN_EIGENVALUE * np.float32(size * size):
+        return False
+    u, v = there[0] * scale + border - half, there[1] * scale + border - half
+    before_u, before_v = 0.0, 0.0
+    for iteration in range(_ITERATIONS):
+        if not (0.0 <= u < width_limit and 0.0 <= v < height_limit):
+            return False
+        of_u, of_v = _compare(second, u, v, size, (width, stride), template, du, dv)
+        step_u = float((c * of_u - b * of_v) / determinant)
+        step_v = float((a * of_v - b * of_u) / determinant)
+        u += step_u
+        v += step_v
+        if step_u * step_u + step_v * step_v <= converged_px * converged_px:
+            break
+        swings = abs(step_u + before_u) < converged_px and abs(step_v + before_v) < converged_px
+        if iteration > 0 and swings:
+            u -= 0.5 * step_u
+            v -= 0.5 * step_v
+            break
+        before_u, before_v = step_u, step_v
+    there[0], there[1] = (u + half - border) / scale, (v + half - border) / scale
+    return True
 
 
 @compiled(**_FAST)
