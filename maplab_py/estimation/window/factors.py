@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import cached_property
 from types import ModuleType
 
 import numpy as np
@@ -35,12 +36,20 @@ class FrameFactors:
     is_resting: Mask  # (F,) frames surely without velocity
     is_turning: Mask  # (F,) frames that only turn, which is less sure
 
+    @cached_property
+    def _walk_weight(self) -> F64:  # once edges are integrated, it stays
+        return self.chain.walk_weight
+
+    @cached_property
+    def _has_still(self) -> bool:
+        return any(mask.any() for mask in (self.chain.is_resting, self.is_resting, self.is_turning))
+
     def costs(self, states: WindowStates) -> dict[str, float]:
         """Return half the sum of squares of every kind at some states."""
         residual, _ = self.chain.evaluate(states.T_M_I, states.motion, EVERY.edges)
         costs = {"inertial": 0.5 * float(np.vdot(residual, residual))}
         nothing = DenseSystem.zeros(0)
-        weight = self.chain.walk_weight
+        weight = self._walk_weight
         costs["bias walk"] = float(kernels.add_walks(states.motion, weight, nothing))
         still = self._still(states, EVERY)
         if still:
@@ -61,7 +70,7 @@ class FrameFactors:
         rows = 15 * np.arange(len(self.chain), dtype=np.int64)[edges]
         costs = {"inertial": float(kernels.add_factors(residual, jacobian, rows, system))}
         weight = np.zeros((len(self.chain), 2))
-        weight[edges] = self.chain.walk_weight[edges]
+        weight[edges] = self._walk_weight[edges]
         costs["bias walk"] = float(kernels.add_walks(states.motion, weight, system))
         still = self._still(states, part)
         if still:
@@ -75,6 +84,8 @@ class FrameFactors:
 
     def _still(self, states: WindowStates, part: Part) -> list[Factors]:
         """Return the factors of edges and frames at rest."""
+        if not self._has_still:
+            return []
         edges, frames = np.arange(len(self.chain))[part.edges], np.arange(len(states))[part.frames]
         resting = edges[self.chain.is_resting[edges]]
         still = frames[self.is_resting[frames] | self.is_turning[frames]]

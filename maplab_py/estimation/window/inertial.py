@@ -45,6 +45,9 @@ class InertialChain:
         self._samples: Samples = []
         self._arguments, self._whitening = np.zeros((0, _MEASURED)), np.zeros((0, 9, 9))
         self._integrated_at, self._seen_at = np.zeros((0, 6)), np.zeros((0, 6))
+        self._latest: tuple[F64, F64, tuple[F64, F64]] | None = None
+        """Poses and motion at which all edges were evaluated last, and the result: an accepted step is tried,
+        then linearised at."""
         self.duration_s = np.zeros(0)
         self.is_resting: Mask = np.zeros(0, dtype=np.bool_)
         self.is_open: Mask = np.zeros(0, dtype=np.bool_)
@@ -193,13 +196,18 @@ class InertialChain:
         The columns are the 15 rows of the first frame and the first 9 of the second.
         """
         self._integrate_stale()
+        is_whole = edges == slice(None)
+        if is_whole and self._latest and self._latest[0] is T_M_I and self._latest[1] is motion:
+            return self._latest[2]
         count = len(range(len(self))[edges])
         arguments = np.empty((count, _INPUTS))
         arguments[:, :7], arguments[:, 7:16] = T_M_I[:-1][edges], motion[:-1][edges]
         arguments[:, 16:23], arguments[:, 23:26] = T_M_I[1:][edges], motion[1:, :3][edges]
         arguments[:, 26:] = self._arguments[edges]
-        residual, jacobian = self._kernel.evaluated(arguments, self._whitening[edges])
-        return residual, jacobian
+        result: tuple[F64, F64] = self._kernel.evaluated(arguments, self._whitening[edges])
+        if is_whole:
+            self._latest = T_M_I, motion, result
+        return result
 
     def _integrate_stale(self) -> None:
         """Integrate edges whose samples are new or have been joined."""
@@ -210,6 +218,7 @@ class InertialChain:
     def _integrate(self, rows: I64, biases: F64) -> None:
         if not len(rows):
             return
+        self._latest = None
         samples = [self._samples[row] for row in rows.tolist()]
         start = starts_of_counts(np.array([len(times_ns) for times_ns, _ in samples]))
         times_ns, accel_gyro = map(np.concatenate, zip(*samples, strict=True))
@@ -227,6 +236,7 @@ class InertialChain:
         self._is_stale[rows] = False
 
     def _drop(self, edge: int) -> None:
+        self._latest = None
         del self._samples[edge]
         for name in _COLUMNS:
             setattr(self, name, np.delete(getattr(self, name), edge, axis=0))
