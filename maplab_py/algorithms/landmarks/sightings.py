@@ -45,19 +45,17 @@ def cameras_of(vi_map: VIMap, keypoints: I64) -> Iterator[tuple[Camera, F64, I64
 
 
 def _T_G_I(vi_map: VIMap, keypoints: I64, camera: Camera) -> F64:
-    """Return the poses (O, 7) at the times of pixels of a camera, to first order in the motion."""
+    """Return the poses (O, 7) at the times of pixels of a camera."""
     vertex = vi_map.keypoint_vertex[keypoints]
     T_G_I = np.asarray(vi_map.T_G_I[vertex])
     if not camera.is_moving:
         return T_G_I
-    from maplab_py.estimation.imu.inertial_data import angular_velocity_at_vertices
+    from maplab_py.estimation.imu.inertial_data import motion_at_vertices
 
-    w_I = angular_velocity_at_vertices(vi_map, vertex)[vertex]
-    delay_s = camera.delay_s(vi_map.keypoints.uv_px[keypoints])[:, None]
     q_G_M = vi_map.T_G_M[vi_map.vertices.mission[vertex], :4]
     v_G = so3.rotate(q_G_M, vi_map.vertices.v_M[vertex])
-    turned = so3.multiply(T_G_I[:, :4], so3.exp(delay_s * w_I))
-    return se3.make(turned, T_G_I[:, 4:] + delay_s * v_G)
+    delay_s = camera.delay_s(vi_map.keypoints.uv_px[keypoints])
+    return motion_at_vertices(vi_map, vertex).of(vertex).after(delay_s, T_G_I, v_G)[0]
 
 
 def is_lidar(vi_map: VIMap, landmarks: NDArray[np.integer]) -> Mask:

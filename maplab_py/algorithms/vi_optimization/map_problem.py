@@ -34,7 +34,7 @@ from maplab_py.array_types import I64, NDArray
 from maplab_py.distinct import distinct
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.estimation.codegen.kernels import visual_kernels
-from maplab_py.estimation.imu.inertial_data import angular_velocity_at_vertices
+from maplab_py.estimation.imu.inertial_data import motion_at_vertices
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.problem.problem import Problem
 from maplab_py.estimation.states import (
@@ -222,8 +222,8 @@ def _visual(
     if rig.is_moving or line_delays or not options.fix_ncamera_time_offset:
         known_s = np.where(np.arange(2) < estimated, 0.0, rig.timing_s)
         known_delay_s = cameras.pixel_delay_s(known_s, data.camera, data.uv_px[:, 1])
-        angular_velocity_I = angular_velocity_at_vertices(vi_map)[selection.vertices]
-        visual.follow_motion(angular_velocity_I, known_delay_s if known_s.any() else None)
+        motion = motion_at_vertices(vi_map).of(selection.vertices)
+        visual.follow_motion(motion, known_delay_s if known_s.any() else None)
         visual.refresh(states)
     rejection = OutlierRejection(visual, sigma_px, options)
     rejection.gate(states)

@@ -11,8 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError
 from maplab_py.estimation.kernels.imu import EdgeSamples
+from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Imu
 from maplab_py.vimap import VIMap, ragged_rows, starts_of_counts, tables, to_hex
+
+_NEAR_S = 0.01
+"""Samples so near a vertex tell how its motion changes while an image is read."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -141,6 +145,17 @@ class InertialData:
         ]
         return np.square(np.array(densities, dtype=np.float64).reshape(-1, 2))
 
+    def near(self, sample: I64) -> tuple[F64, F64]:
+        """Return mean times (E,), from a sample of every edge on, and values (E, 6) of samples near it."""
+        edge = np.repeat(np.arange(len(self)), np.diff(self.sample_start))
+        away_s = 1e-9 * (self.timestamp_ns - self.timestamp_ns[sample][edge])
+        steps = np.abs(np.arange(len(edge)) - sample[edge])
+        weight = ((np.abs(away_s) <= _NEAR_S) | (steps <= 1)).astype(np.float64)
+        columns = np.column_stack([weight, away_s, self.accel_gyro])
+        columns[:, 1:] *= weight[:, None]
+        sums = np.add.reduceat(columns, self.sample_start[:-1], axis=0)
+        return sums[:, 1] / sums[:, 0], sums[:, 2:] / sums[:, :1]
+
     def _edge_of(self, sample: int) -> int:
         return int(np.searchsorted(self.sample_start, sample, side="right")) - 1
 
@@ -152,27 +167,74 @@ class InertialData:
         return f"IMU edge {edge if self.edge_id is None else to_hex(self.edge_id[edge])}"
 
 
-def angular_velocity_at_vertices(vi_map: VIMap, vertices: NDArray[np.integer] | None = None) -> F64:
-    """Return the angular velocity (V, 3) in I [rad/s], biases and intrinsics taken off.
+@dataclasses.dataclass(frozen=True, eq=False)
+class VertexMotion:
+    """Motion of V vertices by the samples near them, biases and intrinsics taken off."""
 
-    The first sample of the edge that leaves a vertex counts, else the last of the one that arrives;
-    a vertex without either is taken to stand still.
+    rate_I: F64  # (V, 3) angular velocity [rad/s]
+    rate_change_I: F64  # (V, 3) angular acceleration [rad/s^2]
+    acceleration_G: F64  # (V, 3) [m/s^2]
+
+    @classmethod
+    def still(cls, count: int) -> VertexMotion:
+        """Return vertices that stand still."""
+        return cls(*np.zeros((3, count, 3)))
+
+    def of(self, rows: NDArray[np.integer]) -> VertexMotion:
+        """Return the motion of some vertices (rows)."""
+        return VertexMotion(self.rate_I[rows], self.rate_change_I[rows], self.acceleration_G[rows])
+
+    def after(self, time_s: F64, T_G_I: F64, v_G: F64) -> tuple[F64, F64]:
+        """Return the poses (V, 7) and velocities (V, 6) [v_G, w_I] a time (V,) later, to second order."""
+        t = time_s[:, None]
+        turn = t * (self.rate_I + 0.5 * t * self.rate_change_I)
+        p_G = T_G_I[:, 4:] + t * (v_G + 0.5 * t * self.acceleration_G)
+        velocity = [v_G + t * self.acceleration_G, self.rate_I + t * self.rate_change_I]
+        poses = se3.make(so3.multiply(T_G_I[:, :4], so3.exp(turn)), p_G)
+        return poses, np.concatenate(velocity, axis=1)
+
+
+def motion_at_vertices(vi_map: VIMap, vertices: NDArray[np.integer] | None = None) -> VertexMotion:
+    """Return the motion of all vertices.
+
+    Means of the samples shortly before and after a vertex give a line. Where only one edge has samples, that
+    next to the vertex counts as constant; a vertex without any is taken to stand still.
 
     Args:
-        vertices: Vertices whose velocities are wanted, None = all; those of others may be zero.
+        vi_map: A map.
+        vertices: Vertices whose motion is wanted, None = all; others may stand still.
     """
-    result = np.zeros((len(vi_map.vertices), 3))
-    table = vi_map.imu_edges
-    wanted = np.zeros(len(result), dtype=np.bool_)
+    count, table = len(vi_map.vertices), vi_map.imu_edges
+    wanted = np.zeros(count, dtype=np.bool_)
     wanted[slice(None) if vertices is None else vertices] = True
     is_near = wanted[table.from_vertex] | wanted[table.to_vertex]
     edges = np.flatnonzero((table.sample_count > 0) & is_near)
-    data = InertialData.of_map(vi_map, edges)
     if not len(edges):
-        return result
-    gyro_corrections = data.corrections[0][data.imu_of_edge]
-    last, first = data.sample_start[1:] - 1, data.sample_start[:-1]
-    for vertex, sample in ((table.to_vertex[edges], last), (table.from_vertex[edges], first)):
-        measured = data.accel_gyro[sample, 3:] - vi_map.vertices.gyro_bias[vertex]
-        result[vertex] = np.einsum("nij,nj->ni", gyro_corrections, measured)
-    return result
+        return VertexMotion.still(count)
+    data = InertialData.of_map(vi_map, edges)
+    first, last = data.sample_start[:-1], data.sample_start[1:] - 1
+    value, change = np.zeros((2, count, 6))
+    time_s, mean, has_side = np.zeros((2, count)), np.zeros((2, count, 6)), np.zeros((2, count))
+    sides = (last, table.to_vertex[edges]), (first, table.from_vertex[edges])
+    for side, (sample, vertex) in enumerate(sides):
+        time_s[side, vertex], mean[side, vertex] = data.near(sample)
+        value[vertex], has_side[side, vertex] = data.accel_gyro[sample], 1.0
+    step_s = time_s[1] - time_s[0]
+    both = np.flatnonzero((has_side.sum(axis=0) == 2.0) & (step_s > 0.0))
+    change[both] = (mean[1, both] - mean[0, both]) / step_s[both, None]
+    value[both] = mean[0, both] - time_s[0, both, None] * change[both]
+    imu, is_known = np.zeros(count, dtype=np.int64), has_side.max(axis=0)[:, None]
+    for _, vertex in sides:
+        imu[vertex] = data.imu_of_edge
+    gyro, accel = (correction[imu] for correction in data.corrections)
+    biases = vi_map.vertices.gyro_bias, vi_map.vertices.accel_bias
+    gravity = np.array([each.gravity_magnitude_mps2 for each in data.imus])[imu]
+    force_I = _times(accel, value[:, :3] - biases[1])
+    acceleration_G = so3.rotate(np.asarray(vi_map.T_G_I)[:, :4], force_I)
+    acceleration_G[:, 2] -= gravity
+    rate_I = _times(gyro, value[:, 3:] - biases[0])
+    return VertexMotion(rate_I * is_known, _times(gyro, change[:, 3:]), acceleration_G * is_known)
+
+
+def _times(matrix: F64, vector: F64) -> F64:
+    return np.asarray((matrix @ vector[:, :, None])[:, :, 0])

@@ -10,6 +10,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, I32, I64, NDArray
 from maplab_py.estimation.codegen.kernels import camera_columns, visual_kernels
+from maplab_py.estimation.imu.inertial_data import VertexMotion
 from maplab_py.estimation.kernels import visual_arguments
 from maplab_py.estimation.kernels.loss import loss_and_weight
 from maplab_py.estimation.kernels.schur_products import KeptSystem, PoseSums
@@ -125,7 +126,7 @@ class VisualTerms:
         self.estimates_cameras = estimate_cameras or estimate_line_delays
         self._estimates_line_delays = estimate_line_delays
         self._uv_motion = self._no_motion() if self.estimates_cameras else np.zeros((0, 2))
-        self._angular_velocity: F64 | None = None
+        self._motion: VertexMotion | None = None
         self._known_delay_s: F64 | None = None
 
     @cached_property
@@ -167,18 +168,19 @@ class VisualTerms:
         """Exchange weights and losses; the structure must be the same."""
         self.observations = observations
 
-    def follow_motion(self, angular_velocity_I: F64, known_delay_s: F64 | None = None) -> None:
-        """Let pixels be of other times than their vertices, to first order in the motion.
+    def follow_motion(self, motion: VertexMotion, known_delay_s: F64 | None = None) -> None:
+        """Let pixels be of other times than their vertices.
 
-        The pixels' velocities are those of the states at the latest `refresh`. Known delays only move
-        the measurements.
+        The velocities of pixels are those halfway between vertex and pixel, at the states of the latest
+        `refresh`: times the delay that is a displacement to second order. Known delays only move the
+        measurements.
 
         Args:
-            angular_velocity_I: Angular velocities (V, 3) [rad/s] of the vertices.
+            motion: Of the V vertices.
             known_delay_s: How much later than its vertex each observation (O,) was taken, beside the
                 delay that the states have; None = no later.
         """
-        self._angular_velocity, self._known_delay_s = angular_velocity_I, known_delay_s
+        self._motion, self._known_delay_s = motion, known_delay_s
         self._uv_motion = self._no_motion()
 
     def _no_motion(self) -> F64:
@@ -189,10 +191,17 @@ class VisualTerms:
 
     def refresh(self, states: States) -> bool:
         """Compute the pixels' velocities again; tell whether there are any."""
-        if self._angular_velocity is None:
+        if self._motion is None:
             return False
-        tangent = np.concatenate([states.v_G, self._angular_velocity], axis=1)
-        self._kernels.pixel_motion(self._data(), self._at(states), tangent, self._uv_motion)
+        at, vertex = self._at(states), self.observations.vertex
+        delay_s = self._timing_delay_s(at) + (
+            0.0 if self._known_delay_s is None else self._known_delay_s
+        )
+        T_G_I, tangent = self._motion.of(vertex).after(
+            0.5 * delay_s, states.T_G_I[vertex], states.v_G[vertex]
+        )
+        data = self._data()._replace(vertex=np.arange(len(vertex), dtype=np.int32))
+        self._kernels.pixel_motion(data, at._replace(T_G_I=T_G_I), tangent, self._uv_motion)
         motion = self._uv_motion[:, :2]
         motion[~np.isfinite(motion).all(axis=1)] = 0.0
         return True
@@ -281,10 +290,14 @@ class VisualTerms:
         """Return reprojection error [px] and depth [m] (O,) of every observation, used or not."""
         data, at, result = self._data(), self._at(states), np.empty((len(self.observations), 2))
         if self.estimates_cameras:
-            delay_s = pixel_delay_s(at.timing_s, data.camera, self._uv_motion[:, -1])
+            delay_s = self._timing_delay_s(at)
             data = data._replace(uv_px=data.uv_px - self._uv_motion[:, :2] * delay_s[:, None])
         self._kernels.evaluate(data, at, result)
         return result[:, 0], result[:, 1]
+
+    def _timing_delay_s(self, at: visual_arguments.VisualStates) -> F64:
+        """Return how much later than its vertex each observation (O,) was taken, as the states say."""
+        return pixel_delay_s(at.timing_s, self.observations.camera, self._uv_motion[:, -1])
 
     def cost(self, states: States) -> float:
         """Return half the sum of rho at some states, without forming any equations."""
@@ -348,7 +361,7 @@ def pose_part(by_node: F64, states: States) -> F64:
 def compile_kernels() -> None:
     """Compile reprojection for all cameras, of moving images, too."""
     visual, states = sample_terms()
-    visual.follow_motion(np.zeros((2, 3)), np.zeros(2))
+    visual.follow_motion(VertexMotion.still(2), np.zeros(2))
     visual.refresh(states)
     rows, cols = visual.block_nodes(states)
     solver = SupernodalCholesky(rows, cols, states.num_nodes, 3)

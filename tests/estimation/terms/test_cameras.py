@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from maplab_py.estimation import blocks, loss
 from maplab_py.estimation.codegen.kernels import residual_kernel, visual_kernels
-from maplab_py.estimation.imu.inertial_data import InertialData
+from maplab_py.estimation.imu.inertial_data import InertialData, VertexMotion
 from maplab_py.estimation.problem.problem import Problem
 from maplab_py.estimation.states import ACCEL_BIAS, GYRO_BIAS, VELOCITY, States
 from maplab_py.estimation.symbolic import sources
@@ -100,9 +100,15 @@ def make_scene(models: tuple[tuple[Projection, Distortion], ...], *, line_delays
     predicted_px = observations.uv_px + scene.residual(states) / INVERSE_SIGMA
     noise_px = rng.normal(0.0, 1.0, (count, 2))
     visual.use(dataclasses.replace(observations, uv_px=predicted_px + noise_px))
-    visual.follow_motion(rng.normal(0, 1, (VERTICES, 3)))
+    visual.follow_motion(turning(rng.normal(0, 1, (VERTICES, 3))))
     visual.refresh(states)
     return scene
+
+
+def turning(rate_I: F64) -> VertexMotion:
+    """Return vertices (V, 3) that turn and are accelerated."""
+    change = np.random.default_rng(3).normal(0, 1, (2, *rate_I.shape))
+    return VertexMotion(rate_I, change[0], change[1])
 
 
 @pytest.fixture(scope="module")
@@ -190,13 +196,35 @@ def test_padding_of_narrow_cameras_has_no_effect(scene: Scene) -> None:
 def test_without_velocities_time_offsets_change_nothing(scene: Scene) -> None:
     still = dataclasses.replace(scene.states, v_G=np.zeros((VERTICES, 3)))
     before = scene.visual.errors(scene.states)[0]
-    scene.visual.follow_motion(np.zeros((VERTICES, 3)))
+    scene.visual.follow_motion(VertexMotion.still(VERTICES))
     scene.visual.refresh(still)
     assert not np.array_equal(scene.visual.errors(still)[0], before)
     linear = scene.problem.linearize(still, 0.0)
     assert not linear.diagonal[still.nodes("camera timing")].any()
-    scene.visual.follow_motion(np.random.default_rng(1).normal(0, 1, (VERTICES, 3)))
+    scene.visual.follow_motion(turning(np.random.default_rng(1).normal(0, 1, (VERTICES, 3))))
     scene.visual.refresh(scene.states)
+
+
+def test_pixels_move_as_far_as_their_vertices_that_are_accelerated() -> None:
+    """What a delay adds to a residual is the way of the projection, not that at a constant velocity."""
+    scene, rng = make_scene(TWO_MODELS, line_delays=True), np.random.default_rng(4)
+    motion, measured = turning(rng.normal(0, 1, (VERTICES, 3))), scene.visual.observations
+    delay_s = np.full(VERTICES, 0.02)
+    T_G_I, _ = motion.after(delay_s, scene.states.T_G_I, scene.states.v_G)
+    now, then = (
+        dataclasses.replace(scene.states, T_G_I=poses).with_blocks(
+            dataclasses.replace(scene.states.blocks["camera timing"], values=np.full((2, 2), delay))
+        )
+        for poses, delay in ((scene.states.T_G_I, [0.02, 0.0]), (T_G_I, [0.0, 0.0]))
+    )
+    errors = []
+    for of_motion in (motion, VertexMotion(motion.rate_I, *np.zeros((2, VERTICES, 3)))):
+        scene.visual.follow_motion(of_motion)
+        scene.visual.refresh(now)
+        errors.append(scene.residual(now) - scene.residual(then))
+    assert len(errors[0]) == len(measured)
+    assert np.abs(errors[0]).max() < 0.02
+    assert np.abs(errors[1]).max() > 0.1
 
 
 def test_known_delays_move_measurements_of_any_kernels(scene: Scene) -> None:
@@ -212,9 +240,9 @@ def test_known_delays_move_measurements_of_any_kernels(scene: Scene) -> None:
     )
     plain = VisualTerms(visual_kernels(), measured, cameras, VERTICES, loss=loss.Loss.CAUCHY)
     velocity = rng.normal(0, 1, (VERTICES, 3))
-    plain.follow_motion(velocity, delay_s)
+    plain.follow_motion(turning(velocity), delay_s)
     assert plain.refresh(scene.states)
-    scene.visual.follow_motion(velocity)
+    scene.visual.follow_motion(turning(velocity))
     scene.visual.refresh(scene.states)
     np.testing.assert_allclose(
         plain.errors(scene.states)[0], scene.visual.errors(scene.states)[0], rtol=1e-12
