@@ -20,8 +20,10 @@ from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
-_NEEDED = re.compile(r"(numba|numpy|opencv-python-headless|protobuf|pyyaml|scipy|threadpoolctl)\b")
-"""Packages that the compilation of kernels imports, besides what writes the residuals' code."""
+_NEEDED = re.compile(
+    r"(casadi|numba|numpy|opencv-python-headless|protobuf|pyyaml|scipy|threadpoolctl)\b"
+)
+"""Packages that the compilation of kernels imports."""
 
 
 class KernelHook(BuildHookInterface):  # type: ignore[type-arg]
@@ -31,9 +33,7 @@ class KernelHook(BuildHookInterface):  # type: ignore[type-arg]
         """Return the requirements of the compilation, as the project states them."""
         if os.environ.get("MAPLAB_WHEEL_KERNELS") == "none":
             return []
-        core = self.metadata.core
-        needed = [each for each in core.dependencies if _NEEDED.match(each)]
-        return [*needed, *core.optional_dependencies["residuals"]]
+        return [each for each in self.metadata.core.dependencies if _NEEDED.match(each)]
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         """Compile, and name the wheel by Python and platform."""

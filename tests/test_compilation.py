@@ -239,10 +239,8 @@ def hook(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
         Path(env["MAPLAB_CACHE_DIR"], "left.lock").write_text("")
 
     monkeypatch.setattr(subprocess, "run", compile_nothing)
-    requirements = ["numba>=0.60", "numpy>=1.26", "rich>=13.7", "numbalike"]
-    extras = {"residuals": ["casadi>=3.6.5"]}
-    core = SimpleNamespace(dependencies=requirements, optional_dependencies=extras)
-    metadata: Any = SimpleNamespace(core=core)
+    requirements = ["numba>=0.60", "numpy>=1.26", "casadi>=3.6.5", "rich>=13.7", "numbalike"]
+    metadata: Any = SimpleNamespace(core=SimpleNamespace(dependencies=requirements))
     return module.KernelHook(str(tmp_path), {}, None, metadata, str(tmp_path), "wheel")
 
 

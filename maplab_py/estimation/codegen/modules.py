@@ -11,13 +11,12 @@ import importlib.util
 import sys
 from collections.abc import Callable
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from types import ModuleType
 
 from maplab_py import kernel_cache
 from maplab_py.atomic import write_file
-from maplab_py.errors import UserError
 from maplab_py.progress import SILENT, Progress
 
 _PREFIX = "maplab_py_generated_"
@@ -40,16 +39,9 @@ def cache_folder() -> Path:
     MAPLAB_CACHE_DIR names another place than the user's cache directory.
 
     Raises:
-        UserError: Somebody else owns the folder or may write to it, or casadi is not installed.
+        UserError: Somebody else owns the folder or may write to it.
     """
-    try:
-        name = f"kernels-{source_hash()}-casadi-{version('casadi')}"
-    except PackageNotFoundError:
-        raise UserError(
-            "casadi is not installed, which writes the code of residuals that the installation "
-            "does not bring: pip install 'maplab-py[residuals]'"
-        ) from None
-    return kernel_cache.cache_folder(name)
+    return kernel_cache.cache_folder(f"kernels-{source_hash()}-casadi-{version('casadi')}")
 
 
 def generated_module(
