@@ -238,8 +238,9 @@ class InertialChain:
     def _drop(self, edge: int) -> None:
         self._latest = None
         del self._samples[edge]
+        kept: Mask = np.arange(len(self._is_stale)) != edge
         for name in _COLUMNS:
-            setattr(self, name, np.delete(getattr(self, name), edge, axis=0))
+            setattr(self, name, getattr(self, name)[kept])
 
 
 def _checked(times_ns: I64, accel_gyro: F64) -> tuple[I64, F64]:

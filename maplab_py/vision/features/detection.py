@@ -259,10 +259,12 @@ class GridDetector:
         occupy_all(selection, np.round(tracked_uv).astype(np.int64))
         selected = _select(image, self._corners(self._detector, image, self._part), selection, room)
         room -= len(selected)
+        if room <= 0:
+            return np.asarray(selected, dtype=np.float64)
         poor = selection.cell_count < 0.5 * self._equal_share
         cells = [self._cell(row, column) for row, column in np.argwhere(poor).tolist()]
         cells = [cell for cell in cells if np.mean(selection.free[cell] > 0) >= _MIN_FREE_SHARE]
-        if room > 0 and cells:
+        if cells:
             corners = [self._corners(self._sensitive, image, cell) for cell in cells]
             more = _select(image, np.concatenate(corners), selection, room)
             selected = np.concatenate([selected, more])
