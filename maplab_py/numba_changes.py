@@ -51,16 +51,16 @@ def _leave_out_what_nobody_reads() -> None:
         function.generator_info = None
 
     def variables(_: Any, value: Any) -> list[Any]:
-        found, rest = [], [value]
+        result, rest = [], [value]
         while rest:
             each = rest.pop()
             if isinstance(each, ir.Var):
-                found.append(each)
+                result.append(each)
             elif isinstance(each, ir.Inst):
-                found += each.list_vars()
+                result += each.list_vars()
             elif isinstance(each, list | tuple | dict):
                 rest += reversed(each.values() if isinstance(each, dict) else each)
-        return found
+        return result
 
     def raise_error(source: Any, target: Any) -> None:
         """Stand for the function that raises the error in kernels."""
