@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64, Mask, NDArray, Rows
+from maplab_py.array_types import F64, I64, NDArray, Rows
 from maplab_py.errors import MapError, UserError
 from maplab_py.input_files import decode_foreign, read_bytes
 from maplab_py.interop.recordings import bag_files
@@ -348,14 +348,12 @@ def _day_ns(date: str) -> int:
     return (day - dt.date(1970, 1, 1)).days * _DAY_NS
 
 
-def east_north_up_m(
-    track: GpsTrack, origin: tuple[float, float, float], rows: Mask | slice = slice(None)
-) -> F64:
+def east_north_up_m(track: GpsTrack, origin: tuple[float, float, float]) -> F64:
     """Return the positions (N, 3) east, north and up of an origin [deg, deg, m]."""
     from pymap3d import geodetic2enu
 
     east, north, up = geodetic2enu(
-        track.latitude_deg[rows], track.longitude_deg[rows], track.altitude_m[rows], *origin
+        track.latitude_deg, track.longitude_deg, track.altitude_m, *origin
     )
     return np.stack([east, north, up], axis=1).astype(np.float64)
 

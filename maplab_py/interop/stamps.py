@@ -136,7 +136,7 @@ def parse_stamps(
     )
 
 
-def read_stamps(path: Path, kind: StampKind, *, unit: str = "", custom: str = "s") -> Stamps:
+def read_stamps(path: Path, kind: StampKind, *, unit: str = "") -> Stamps:
     """Read a file with one stamp per line; comments (`#`) may name the unit.
 
     Raises:
@@ -149,7 +149,7 @@ def read_stamps(path: Path, kind: StampKind, *, unit: str = "", custom: str = "s
     if not rows:
         raise MapError(f"{path}: there are no time stamps in the file: write or copy it again")
     lines, tokens = zip(*rows, strict=True)
-    return parse_stamps(tokens, kind, str(path), lines, unit=unit, header=header, custom=custom)
+    return parse_stamps(tokens, kind, str(path), lines, unit=unit, header=header, custom="s")
 
 
 class _Numbers:

@@ -83,7 +83,7 @@ def landmark_facts(vi_map: VIMap, row: int) -> Facts:
         ),
         ("missions", names or "none"),
         ("seen over", seen),
-        ("distance", _range_text(distance, "m")),
+        ("distance", _range_text_m(distance)),
         ("largest ray angle", f"{_largest_angle_deg(vi_map, landmark.p_G, observers):.1f} deg"),
         ("reprojection error", _error_text(vi_map, landmark.keypoints)),
         ("stored in", _short(vi_map.vertices.id[landmark.vertex])),
@@ -200,7 +200,7 @@ def _vector(v: F64, digits: int = 3) -> str:
     return "[" + ", ".join(f"{x:.{digits}f}" for x in v.tolist()) + "]"
 
 
-def _range_text(values: F64, unit: str) -> str:
+def _range_text_m(values: F64) -> str:
     if not len(values):
         return "-"
-    return f"{values.min():.2f} to {values.max():.2f} {unit}"
+    return f"{values.min():.2f} to {values.max():.2f} m"

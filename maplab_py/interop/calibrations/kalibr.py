@@ -30,7 +30,7 @@ def is_camera_chain(entry: yaml_entry.Entry) -> bool:
     return any(_camera_number(key) is not None for key in entry)
 
 
-def read_camera_chain(entry: yaml_entry.Entry, form: str = "kalibr") -> Parts:
+def read_camera_chain(entry: yaml_entry.Entry) -> Parts:
     """Return the cameras of a chain, on the IMU where the chain has their poses on it.
 
     Raises:
@@ -64,7 +64,7 @@ def read_camera_chain(entry: yaml_entry.Entry, form: str = "kalibr") -> Parts:
     notes += note_unknown_keys(entry, _NOT_OF_THE_CALIBRATION)
     if why:  # the body is the first camera
         poses = se3.compose(poses, se3.inverse(poses[0]))
-    return Parts(form, cameras, se3.inverse(poses), why_not_on_imu=why, notes=notes)
+    return Parts("kalibr", cameras, se3.inverse(poses), why_not_on_imu=why, notes=notes)
 
 
 def _camera_number(key: object) -> int | None:
@@ -104,7 +104,7 @@ def _compare_pairs(entry: yaml_entry.Entry, T_cam_B: F64) -> list[str]:
     return notes
 
 
-def read_kalibr_imu(top: yaml_entry.Entry, form: str = "kalibr") -> Parts:
+def read_kalibr_imu(top: yaml_entry.Entry) -> Parts:
     """Return the IMU of kalibr's or OpenVINS' IMU file; B is the frame i that cameras refer to.
 
     Raises:
@@ -120,7 +120,7 @@ def read_kalibr_imu(top: yaml_entry.Entry, form: str = "kalibr") -> Parts:
     imu = models.read_imu(entry, models.KALIBR_NOISE, topic=entry.text("rostopic"))
     imu, T_I_i = with_measurement_matrices(imu, *_measurement_matrices(entry))
     notes = note_unknown_keys(top, (*_NOT_OF_THE_CALIBRATION, "integration_sigma"))
-    return Parts(form, imu=imu, T_B_I=se3.inverse(T_I_i), notes=notes)
+    return Parts("kalibr", imu=imu, T_B_I=se3.inverse(T_I_i), notes=notes)
 
 
 def with_measurement_matrices(imu: Imu, W: F64, A: F64) -> tuple[Imu, F64]:

@@ -155,11 +155,6 @@ class Inbox:
         """Images without partners in the other cameras, by camera."""
         return self._matcher.unmatched
 
-    @property
-    def waiting_sets(self) -> int:
-        """Sets that nobody has taken."""
-        return len(self._sets)
-
     def put_image(self, image: Message) -> None:
         """Take an image."""
         with self._changed:

@@ -87,9 +87,9 @@ def _frames(
         yield with_caption(picture, (title, *state_facts(curves, number)), is_dark=is_dark)
 
 
-def evenly_spread(count: int, limit: int = MAX_STATES) -> I64:
-    """Return at most `limit` of the numbers below a count, the first and the last included."""
-    return np.unique(np.linspace(0, count - 1, min(count, limit)).round().astype(np.int64))
+def evenly_spread(count: int) -> I64:
+    """Return at most `MAX_STATES` of the numbers below a count, the first and the last included."""
+    return np.unique(np.linspace(0, count - 1, min(count, MAX_STATES)).round().astype(np.int64))
 
 
 def with_caption(picture: U8, lines: tuple[str, ...], *, is_dark: bool) -> U8:

@@ -360,11 +360,11 @@ def mission_label(mission: MissionEntry) -> str:
     return f"{mission.name}  {mission.length_m:.0f} m  {minutes}:{seconds:02d}"
 
 
-def mission_legend(missions: Iterable[MissionEntry], limit: int = 24) -> str:
+def mission_legend(missions: Iterable[MissionEntry]) -> str:
     """Return the missions' colours."""
     entries = [LegendEntry(mission_label(m), (m.colour,)) for m in missions]
-    more = f"<div style='opacity:0.6'>and {len(entries) - limit} more</div>"
-    return legend(entries[:limit], more if len(entries) > limit else "")
+    more = f"<div style='opacity:0.6'>and {len(entries) - MAX_SWITCHES} more</div>"
+    return legend(entries[:MAX_SWITCHES], more if len(entries) > MAX_SWITCHES else "")
 
 
 def legend(entries: Iterable[LegendEntry], more: str = "") -> str:

@@ -93,16 +93,13 @@ class Nodes:
         """Send hidden layers too, as nodes that are not visible, for as long as this lasts."""
         with self._server.atomic():
             self.show(scene, set(scene.names), missions)
-            self._set_visible(set(scene.names) - layers, is_visible=False)
+            for (layer, *_), node in self._nodes.items():
+                for handle in node.handles if layer not in layers else ():
+                    handle.visible = False
         try:
             yield
         finally:
             self.show(scene, layers, missions)
-
-    def _set_visible(self, layers: set[str], *, is_visible: bool) -> None:
-        handles = (h for key, node in self._nodes.items() if key[0] in layers for h in node.handles)
-        for handle in handles:
-            handle.visible = is_visible
 
     def scale_points(self, factor: float) -> None:
         """Draw all points larger or smaller."""
