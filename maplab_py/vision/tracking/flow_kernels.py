@@ -45,22 +45,29 @@ def follow_on_level(first, second, border, size, level, turn, uv, there, levels,
     for block in prange(-(-len(uv) // _BLOCK)):
         square = np.zeros((size + 3) * stride, dtype=np.float32)
         template = np.zeros(size * stride, dtype=np.float32)
-        du, dv = np.zeros_like(template), np.zeros_like(template)
+        patch = square, template, np.zeros_like(template), np.zeros_like(template)
         for k in range(block * _BLOCK, min((block + 1) * _BLOCK, len(uv))):
             is_tracked[k] = False
             if level <= levels[k]:
                 is_tracked[k] = _follow(
-                    first, second, border, size, level, turn, uv[k], there[k],
-                    (width, stride), square, template, du, dv,
-                )  # fmt: skip
+                    first,
+                    second,
+                    border,
+                    (size, width, stride),
+                    level,
+                    turn,
+                    uv[k],
+                    there[k],
+                    patch,
+                )
 
 
 @compiled(**_FAST)
-def _follow(  # type: ignore[no-untyped-def]
-    first, second, border, size, level, turn, uv, there, widths, square, template, du, dv
-):
+def _follow(first, second, border, sizes, level, turn, uv, there, patch):  # type: ignore[no-untyped-def]
     """Move one keypoint; return whether it can be followed."""
-    (width, stride), half, scale = widths, size // 2, 0.5**level
+    size, width, stride = sizes
+    square, template, du, dv = patch
+    half, scale = size // 2, 0.5**level
     converged_px = _CONVERGED_PX if level == 0 else _COARSELY_CONVERGED_PX
     height_limit, width_limit = second.shape[0] - size - 2.0, second.shape[1] - width - 2.0
     u0, v0 = uv[0] * scale + border, uv[1] * scale + border
