@@ -26,6 +26,7 @@ from maplab_py.interop.recordings.protocol import (
 from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.simulation.scenario import MotionOptions
 from maplab_py.vimap.nav_state import NavState
+from tests.estimation.window.recordings import scenario, simulated
 from tests.frontend.known_start import KnownStart
 from tests.frontend.simulated import REST_FIRST, position_errors, replayed
 
@@ -374,3 +375,19 @@ def test_only_what_is_named_is_estimated() -> None:
     assert odometry.calibration_estimate is None
     with pytest.raises(FlagError, match="--vio_estimate: there is no focus: give some of"):
         OdometryOptions(estimate="extrinsics,focus")
+
+
+def test_rows_of_a_known_rolling_shutter_are_no_delay() -> None:
+    options = scenario(seed=3, duration_s=10.0, rate_hz=20.0, keypoints=80)
+    rolling = [dataclasses.replace(c, line_delay_s=0.02 / c.height_px) for c in options.cameras]
+    tracks = simulated(dataclasses.replace(options, cameras=tuple(rolling)))
+    unknown = [dataclasses.replace(c, line_delay_ns=0, image_delay_s=0.0) for c in tracks.cameras]
+    delays_s = []
+    for device in (tracks.device, tracks.device.with_cameras(tuple(unknown), tracks.T_I_C)):
+        monitor = DelayMonitor(device)
+        for frame in tracks.frames:
+            monitor.push(frame)
+            monitor.applied_s = 0.0  # frames stay at their times
+        delays_s.append(abs(monitor.delay_s))
+    assert delays_s[0] < 5e-4
+    assert delays_s[1] > 1.5e-3

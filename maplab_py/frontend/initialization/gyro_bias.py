@@ -16,7 +16,7 @@ from maplab_py.array_types import F64, I64
 from maplab_py.estimation.imu.inertial_data import InertialData
 from maplab_py.estimation.imu.preintegration import integrate
 from maplab_py.frontend.initialization import gyro_bias_kernels
-from maplab_py.frontend.initialization.rays import SegmentRays
+from maplab_py.frontend.initialization.rays import SegmentRays, angular_velocity
 from maplab_py.geometry import so3
 from maplab_py.vimap.table import starts_of_counts
 
@@ -165,13 +165,6 @@ def delayed(inertial: InertialData, delay_s: float) -> InertialData:
     return dataclasses.replace(
         inertial, sample_start=start, timestamp_ns=every_ns[rows], accel_gyro=values[rows]
     )
-
-
-def angular_velocity(inertial: InertialData, gyro_bias: F64) -> F64:
-    """Return the angular velocity (F, 3) [rad/s] at the frames, with which edges begin and end."""
-    rows = np.append(inertial.sample_start[:-1], inertial.sample_start[-1] - 1)
-    T_g_inverse = inertial.corrections[0][0]
-    return np.asarray((inertial.accel_gyro[rows, 3:] - gyro_bias) @ T_g_inverse.T)
 
 
 def gauss_newton_step(
