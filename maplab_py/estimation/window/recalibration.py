@@ -32,7 +32,7 @@ class WindowChange:
 
     T_old_new: F64  # (7,) by which poses of the IMU change so that camera 0 stays
     correction: tuple[F64, F64]  # old (2, 3, 3) and new: of gyroscope and accelerometer
-    size: float  # turn of the mounting, and largest relative changes of camera and IMU
+    size: float  # turns of the mounting and in a delay, and largest relative changes
 
     @classmethod
     def between(cls, before: tuple[WindowCameras, F64], after: tuple[WindowCameras, F64]) -> Self:
@@ -42,6 +42,7 @@ class WindowChange:
         turn = float(np.linalg.norm(so3.log(T_old_new[:4])))
         relative = np.abs(new.parameters - old.parameters) / np.maximum(abs(old.parameters), 0.1)
         size = turn + float(relative.max()) + float(np.abs(of_new - of_old).max())
+        size += _RATE_RADPS * float(np.abs(new.timing_s - old.timing_s)[:, 0].max())
         return cls(T_old_new, (of_old, of_new), size)
 
     def states(self, states: WindowStates, rate_I: F64, mean: F64) -> WindowStates:

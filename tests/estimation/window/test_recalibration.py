@@ -68,6 +68,14 @@ def test_a_right_calibration_is_at_once_better_without_a_jump() -> None:
     assert np.linalg.norm(step - true_step) < 5e-3
 
 
+def test_a_window_without_its_delay_doubts_what_it_has_made_of_it() -> None:
+    tracks = simulated(scenario(duration_s=8.0, stereo=False, keypoints=80, seed=2))
+    late = tuple(dataclasses.replace(camera, image_delay_s=0.01) for camera in tracks.cameras)
+    wrong_rig, right = ((of, tracks.T_I_C, tracks.imu) for of in (late, tracks.cameras))
+    before, switched = (estimates(tracks, wrong_rig, then) for then in (None, right))
+    assert error_m(tracks, switched) < 0.25 * error_m(tracks, before)
+
+
 def test_biases_explain_the_samples_as_before() -> None:
     tracks = simulated(scenario(duration_s=3.0, stereo=False, keypoints=80))
     cameras, T_I_C, imu = wrong(tracks)
