@@ -137,7 +137,8 @@ def _has_wrong_calibration(
     """Tell whether the calibration or the stamps were mended, or the residuals of the map contradict them."""
     if is_to_end() or not mapping.options.odometry.apply_calibration:
         return False
-    if mapping.odometry.watch.failures:
+    failures = mapping.odometry.watch.failures
+    if any(each.is_used or not each.sensor.startswith("camera ") for each in failures):
         return False
     try:
         is_mended = mapping.is_mended or _applied_delay_s(mapping) != 0.0

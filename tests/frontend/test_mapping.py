@@ -14,6 +14,7 @@ import pytest
 from maplab_py.array_types import F64
 from maplab_py.errors import Cancelled, EstimationError, FlagError, MapError, UserError
 from maplab_py.frontend import finishing
+from maplab_py.frontend.failures.watch import SensorFailure
 from maplab_py.frontend.finishing import _calibration_notes, finish, scale_verdict
 from maplab_py.frontend.health import HealthMonitor
 from maplab_py.frontend.mapping import Mapping
@@ -414,6 +415,10 @@ def test_a_map_that_contradicts_its_calibration_is_optimised_with_it_free() -> N
     wrong = with_rig(recording, turn_deg=(0.0, 1.5, 0.0), move_m=(0.02, 0.0, 0.0))
     mapping = Mapping(wrong, make_starter=start)
     mapping.run()
+    failed = SensorFailure(
+        "camera 0", "its points do not fit", recording.start_ns, recording.start_ns
+    )
+    mapping.odometry.watch.failures.append(failed)
     finished = finish(mapping, wrong.name)
     assert finished.vi_map is not None
     device, sensors = recording.device, finished.vi_map.sensors
@@ -422,6 +427,9 @@ def test_a_map_that_contradicts_its_calibration_is_optimised_with_it_free() -> N
     assert np.degrees(np.linalg.norm(turned, axis=1)).max() < 0.3
     (note,) = (line for line in finished.report.notes if "calibration of the cameras free" in line)
     assert "rotation on the IMU" in note
+    mapping.odometry.watch.failures[:] = [dataclasses.replace(failed, sensor="gyroscope")]
+    assert not any("cameras free" in line for line in finish(mapping, wrong.name).report.notes)
+    mapping.odometry.watch.failures.clear()
     kept = dataclasses.replace(OdometryOptions(), apply_calibration=False)
     mapping.options = dataclasses.replace(mapping.options, odometry=kept)
     assert not any("calibration" in line for line in finish(mapping, wrong.name).report.notes)
