@@ -51,7 +51,10 @@ class RecordedSensors:
         """Return the same sensors with another calibration of the cameras, poses (C, 7) on the IMU."""
         T_I_B = self.sensors.T_I_S(self.imu_id, self.rig_id)
         T_B_C = se3.compose(se3.inverse(T_I_B), T_I_C)
-        rig = dataclasses.replace(self.rig, cameras=cameras, T_B_C=T_B_C)
+        return self.with_rig(dataclasses.replace(self.rig, cameras=cameras, T_B_C=T_B_C))
+
+    def with_rig(self, rig: CameraRig) -> RecordedSensors:
+        """Return the same sensors with another calibration of the rig under its id."""
         known = dataclasses.replace(self.sensors, sensors={**self.sensors.sensors, rig.id: rig})
         return dataclasses.replace(self, sensors=known)
 
@@ -156,14 +159,40 @@ def with_cameras(device: RecordedSensors, rows: tuple[int, ...]) -> RecordedSens
     return dataclasses.replace(device, sensors=chosen, rig_id=part.id)
 
 
+def at_middle_rows(device: RecordedSensors) -> RecordedSensors:
+    """Return the device with images whose times are those of their middle rows.
+
+    The known lateness of the rows moves to the time offset: its mean over the cameras, so that images taken
+    together stay partners.
+    """
+    cameras = device.cameras if device.rig_id else ()
+    late_s = [float(c.delay_s(np.array([[0.0, 0.5 * c.height_px]]))[0]) for c in cameras]
+    shift_ns = round(1e9 * np.mean(late_s)) if late_s else 0
+    if not shift_ns:
+        return device
+    moved = [
+        dataclasses.replace(
+            camera,
+            time_offset_ns=camera.time_offset_ns + shift_ns,
+            image_delay_s=camera.image_delay_s - 1e-9 * shift_ns,
+        )
+        for camera in cameras
+    ]
+    note = (
+        f"images count at the time of their middle row, {1e-6 * shift_ns:+.3f} ms by the calibration: "
+        f"time offset of camera 0 {1e-6 * moved[0].time_offset_ns:.3f} ms, image delay "
+        f"{1e3 * moved[0].image_delay_s:.3f} ms"
+    )
+    known = device.with_rig(dataclasses.replace(device.rig, cameras=tuple(moved)))
+    return dataclasses.replace(known, notes=(*device.notes, note))
+
+
 def with_time_offset(device: RecordedSensors, offset_ns: int) -> RecordedSensors:
     """Return the device with another time offset of all cameras (t_imu = t_camera + offset)."""
     cameras = tuple(
         dataclasses.replace(camera, time_offset_ns=offset_ns) for camera in device.rig.cameras
     )
-    rig = dataclasses.replace(device.rig, cameras=cameras)
-    sensors = {**device.sensors.sensors, rig.id: rig}
-    return dataclasses.replace(device, sensors=dataclasses.replace(device.sensors, sensors=sensors))
+    return device.with_rig(dataclasses.replace(device.rig, cameras=cameras))
 
 
 def _camera_id(camera: Camera) -> str:

@@ -5,7 +5,7 @@ from pathlib import Path
 from maplab_py.errors import UserError
 from maplab_py.interop.calibration_import import import_calibration, read_calibration
 from maplab_py.interop.calibrations.euroc import HOW_TO_CALIBRATE
-from maplab_py.interop.device import RecordedSensors, with_cameras, with_time_offset
+from maplab_py.interop.device import RecordedSensors, at_middle_rows, with_cameras, with_time_offset
 from maplab_py.interop.recordings.bag_files import is_bag
 from maplab_py.interop.recordings.bags import BagRecording
 from maplab_py.interop.recordings.folders import FolderRecording, image_root
@@ -100,8 +100,8 @@ def given_device(options: SourceOptions, source: str) -> RecordedSensors:
 
 
 def _chosen(device: RecordedSensors, options: SourceOptions) -> RecordedSensors:
-    """Return the device with the cameras and the time offset that the options choose."""
-    chosen = with_cameras(device, options.active_cameras)
+    """Return the device with the cameras and the time offset of middle rows that the options choose."""
+    chosen = at_middle_rows(with_cameras(device, options.active_cameras))
     if options.imu_to_camera_time_offset_ns is None:
         return chosen
     return with_time_offset(chosen, options.imu_to_camera_time_offset_ns)

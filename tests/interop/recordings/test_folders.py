@@ -16,6 +16,7 @@ from maplab_py.interop.recordings import protocol, summary
 from maplab_py.interop.recordings.options import ReadingOptions, SourceOptions, StreamOptions
 from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.recordings.stream import EventStream
+from maplab_py.sensors.sensors_yaml import write_sensors
 from tests.interop.recordings.written import (
     START_NS,
     assert_content,
@@ -108,6 +109,32 @@ def test_some_cameras(folder: Path) -> None:
     for wrong in ("2", "0,0", "-1", "x"):
         with pytest.raises(MaplabError, match="rovio_active_camera_indices"):
             open_recording(folder, SourceOptions(rovio_active_camera_indices=wrong))
+
+
+@pytest.mark.parametrize("delays_s", [(0.02, 0.02), (-0.008, -0.01), (0.0, 0.0)])
+def test_images_count_at_the_time_of_their_middle_row(
+    folder: Path, tmp_path: Path, delays_s: tuple[float, float]
+) -> None:
+    device = open_recording(folder).device
+    line_ns = 20_000 if delays_s[1] < 0.0 else 0
+    late = [
+        dataclasses.replace(c, image_delay_s=s, time_offset_ns=3_000_000, line_delay_ns=line_ns)
+        for c, s in zip(device.cameras, delays_s, strict=True)
+    ]
+    given = device.with_rig(dataclasses.replace(device.rig, cameras=tuple(late)))
+    file = tmp_path / "sensors.yaml"
+    file.write_text(write_sensors(given.sensors))
+    opened = open_recording(folder, SourceOptions(file)).device
+    pixels = np.array([[0.0, 0.0], [3.0, 0.5 * late[0].height_px]])
+    middle_s = [camera.delay_s(pixels)[1] for camera in opened.cameras]
+    assert np.mean(middle_s) == pytest.approx(0.0, abs=1e-9)
+    for ours, theirs in zip(opened.cameras, late, strict=True):
+        assert ours.line_delay_ns == theirs.line_delay_ns
+        seen_s, truth_s = (1e-9 * c.time_offset_ns + c.delay_s(pixels) for c in (ours, theirs))
+        np.testing.assert_allclose(seen_s, truth_s, atol=1e-12)
+    assert len({camera.time_offset_ns for camera in opened.cameras}) == 1
+    is_noted = any("time of their middle row" in note for note in opened.notes)
+    assert is_noted == (opened.cameras[0].time_offset_ns != 3_000_000)
 
 
 def test_a_time_offset_replaces_that_of_the_calibration(folder: Path) -> None:
