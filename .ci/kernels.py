@@ -21,9 +21,9 @@ from typing import Any
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 _NEEDED = re.compile(
-    r"(casadi|numba|numpy|opencv-python-headless|protobuf|pyyaml|scipy|threadpoolctl)\b"
+    r"(casadi|numba|numpy|opencv-python-headless|protobuf|pymetis|pyyaml|scipy|threadpoolctl)\b"
 )
-"""Packages that the compilation of kernels imports."""
+"""Packages that the compilation of kernels imports; with pymetis elimination is ordered by other kernels."""
 
 
 class KernelHook(BuildHookInterface):  # type: ignore[type-arg]
