@@ -136,14 +136,21 @@ class MapServer:
         return future.result()
 
     def status(self) -> server_options.ServerStatus:
-        """Return the present state."""
-        items = dict(self._intake.items)
-        published = tuple(m for m in self.journal.merged if m.number not in items)
+        """Return the present state.
+
+        What has arrived is counted first, and what is accepted on disk: a submap that moves on meanwhile is
+        counted twice, and never as if it were done.
+        """
+        incoming = len(self.spool.arrivals())
+        preparing = sum(item.is_preparing for item in list(self._intake.items.values()))
+        entries = {entry.number: entry.robot for entry in self.spool.entries()}
+        published = tuple(m for m in self.journal.merged if m.number not in entries)
         return status_of(
             self,
             dataclasses.replace(self.journal, merged=published),
-            preparing=sum(item.is_preparing for item in items.values()),
-            pending=[item.entry.robot for item in items.values()],
+            incoming=incoming,
+            preparing=preparing,
+            pending=list(entries.values()),
             problem=self._problem,
             url=self._url,
         )

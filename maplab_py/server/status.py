@@ -44,6 +44,7 @@ def status_of(
     server: MapServer,
     journal: Journal,
     *,
+    incoming: int,
     preparing: int,
     pending: list[str],
     problem: str,
@@ -53,6 +54,7 @@ def status_of(
 
     Args:
         journal: What is published.
+        incoming: Submaps that are not taken yet.
         preparing: Submaps in workers.
         pending: Robots of all submaps that are not published.
         problem: What keeps it from publishing.
@@ -66,6 +68,7 @@ def status_of(
         is_running=True,
         merged_map_folder=str(server.publisher.folder),
         url=url,
+        incoming=incoming,
         preparing=preparing,
         pending=pending,
         published_s_ago=None if published_s is None else time.monotonic() - published_s,
@@ -91,6 +94,7 @@ def status_without_server(spool: Spool) -> ServerStatus:
         is_running=False,
         merged_map_folder="",
         url="",
+        incoming=len(spool.arrivals()),
         preparing=0,
         pending=[entry.robot for entry in spool.entries()],
         published_s_ago=None,
@@ -107,6 +111,7 @@ def _status(
     is_running: bool,
     merged_map_folder: str,
     url: str,
+    incoming: int,
     preparing: int,
     pending: list[str],
     published_s_ago: float | None,
@@ -132,9 +137,9 @@ def _status(
         missions=len(shown.missions),
         vertices=len(shown.vertices),
         landmarks=len(shown.landmarks),
-        incoming=len(spool.arrivals()),
+        incoming=incoming,
         preparing=preparing,
-        waiting=len(pending) - preparing,
+        waiting=max(len(pending) - preparing, 0),
         merged=len(journal.merged),
         rejected=len(list(spool.rejected.glob("[0-9]*"))),
         since_joint_optimization=journal.since_joint,
