@@ -179,9 +179,8 @@ def at_middle_rows(device: RecordedSensors) -> RecordedSensors:
         for camera in cameras
     ]
     note = (
-        f"images count at the time of their middle row, {1e-6 * shift_ns:+.3f} ms by the calibration: "
-        f"time offset of camera 0 {1e-6 * moved[0].time_offset_ns:.3f} ms, image delay "
-        f"{1e3 * moved[0].image_delay_s:.3f} ms"
+        f"images count at the time of their middle row, {1e-6 * shift_ns:+.3f} ms by the calibration; "
+        "--imu_to_camera_time_offset_ns is the offset of that row"
     )
     known = device.with_rig(dataclasses.replace(device.rig, cameras=tuple(moved)))
     return dataclasses.replace(known, notes=(*device.notes, note))
