@@ -18,7 +18,7 @@ from maplab_py.algorithms.loop_closure import closure_record, listing
 from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
 from maplab_py.algorithms.loop_closure.reports import Verdict as ClosureVerdict
 from maplab_py.algorithms.recording_check.doctor import map_findings
-from maplab_py.algorithms.recording_check.findings import Finding, Verdict, cause, ok, unknown
+from maplab_py.algorithms.recording_check.findings import Check, Finding, Verdict, cause
 from maplab_py.algorithms.scale_check import mission_scales
 from maplab_py.array_types import F64
 from maplab_py.estimation.imu.inertial_data import InertialData
@@ -143,23 +143,20 @@ def _graded(
     check: str, value: float, bounds: tuple[float, float], observed: str, expected: str, remedy: str
 ) -> Finding:
     """Return a finding: well below the first bound, wrong above the second."""
+    of_value = Check(check, expected)
     if value <= bounds[0]:
-        return ok(check, observed, expected)
-    verdict = Verdict.NOTE if value <= bounds[1] else Verdict.WRONG
-    return Finding(check, observed, expected, verdict, remedy)
+        return of_value.ok(observed)
+    return (of_value.note if value <= bounds[1] else of_value.wrong)(observed, remedy)
 
 
 def _consistency(vi_map: VIMap) -> Iterator[Finding]:
     report = consistency.check_consistency(vi_map)
-    rules = counted(len(report.errors), "violated rule")
+    rules, check = counted(len(report.errors), "violated rule"), Check("consistency", "none")
     if report.errors:
         first = report.errors[0].rule
-        yield Finding(
-            "consistency", f"{rules}, first: {first}", "none", Verdict.HOPELESS,
-            "check_map_consistency lists them",
-        )  # fmt: skip
+        yield check.hopeless(f"{rules}, first: {first}", "check_map_consistency lists them")
     else:
-        yield ok("consistency", rules, "none")
+        yield check.ok(rules)
 
 
 def _calibration(vi_map: VIMap) -> Iterator[Finding]:
@@ -168,26 +165,26 @@ def _calibration(vi_map: VIMap) -> Iterator[Finding]:
     yield from (f for f in findings if f.verdict is not Verdict.UNKNOWN)
     reason = next((f.observed for f in findings if f.verdict is Verdict.UNKNOWN), "")
     if reason or not findings:
-        observed = reason or "no tracks and IMU samples to compare"
-        yield unknown("rest of the calibration", observed, "agrees with tracks and samples")
+        check = Check("rest of the calibration", "agrees with tracks and samples")
+        yield check.unknown(reason or "no tracks and IMU samples to compare")
 
 
 def _scale(vi_map: VIMap) -> Iterator[Finding]:
     scales = mission_scales(vi_map)
     labels = queries.mission_labels(vi_map)
     for scale in scales:
-        observed, expected = f"{scale.scale:.3f} of the IMU's lengths", "0.9 to 1.1"
-        name = f"metric scale of {labels[scale.mission]}"
+        check = Check(f"metric scale of {labels[scale.mission]}", "0.9 to 1.1")
+        observed = f"{scale.scale:.3f} of the IMU's lengths"
         if scale.doubt:
-            yield Finding(name, observed, expected, Verdict.WRONG, scale.doubt)
+            yield check.wrong(observed, scale.doubt)
         elif abs(scale.scale - 1.0) > _SCALE_ERROR:
-            remedy = "optvi, then self_calibrate"
-            yield Finding(name, observed, expected, Verdict.NOTE, remedy)
+            yield check.note(observed, "optvi, then self_calibrate")
         else:
-            yield ok(name, observed, expected)
+            yield check.ok(observed)
     if len(scales) < len(vi_map.missions):
         missing = counted(len(vi_map.missions) - len(scales), "mission")
-        yield unknown("metric scale", f"{missing} without enough acceleration", "0.1 m/s^2")
+        check = Check("metric scale", "0.1 m/s^2")
+        yield check.unknown(f"{missing} without enough acceleration")
 
 
 def _biases(vi_map: VIMap) -> Iterator[Finding]:
@@ -225,7 +222,7 @@ def _bias_changes(vi_map: VIMap) -> F64:
 
 def _landmarks(vi_map: VIMap, progress: Progress) -> Iterator[Finding]:
     if not len(vi_map.landmarks):
-        yield unknown("landmarks", "the map has none", "landmarks")
+        yield Check("landmarks", "landmarks").unknown("the map has none")
         return
     judged, report = quality.evaluate_quality(vi_map, LandmarkQualityOptions(), progress=progress)
     share = report.bad / max(report.landmarks, 1)
@@ -290,14 +287,15 @@ def _base_frames(vi_map: VIMap) -> Iterator[Finding]:
     if len(vi_map.missions) < 2:
         return
     known = vi_map.baseframes.is_known[vi_map.missions.baseframe]
+    check = Check("base frames", "all")
     observed = f"{int(known.sum())} of {len(known)} missions are anchored"
     if known.all():
-        yield ok("base frames", observed, "all")
+        yield check.ok(observed)
     else:
         remedy = (
             "" if known.any() else "set_mission_baseframe_to_known, then "
         ) + "anchor_all_missions"
-        yield Finding("base frames", observed, "all", Verdict.NOTE, remedy)
+        yield check.note(observed, remedy)
 
 
 def _disk(vi_map: VIMap, folder: Path | None) -> Iterator[Finding]:
@@ -305,7 +303,7 @@ def _disk(vi_map: VIMap, folder: Path | None) -> Iterator[Finding]:
 
     needed_gb = 1e-9 * vi_map.nbytes()
     if folder is None or not folder.is_dir():
-        yield unknown("disk", "the map is not saved", "room for two copies")
+        yield Check("disk", "room for two copies").unknown("the map is not saved")
         return
     free_gb = 1e-9 * shutil.disk_usage(folder).free
     size_gb = 1e-9 * sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())

@@ -307,7 +307,6 @@ def check_recording(
     checked = doctor.report(diagnosis, opened)
     if apply is None:
         return checked
-    corrected = correction.correct(diagnosis)
-    write_text(apply, [write_sensors(corrected.device.sensors)], overwrite=overwrite)
-    notes = (*checked.notes, *corrected.notes)
-    return dataclasses.replace(checked, sensors_file=apply, notes=notes)
+    device, changes = correction.correct(diagnosis)
+    write_text(apply, [write_sensors(device.sensors)], overwrite=overwrite)
+    return dataclasses.replace(checked, sensors_file=apply, notes=(*checked.notes, *changes))

@@ -19,16 +19,8 @@ _SAME_CLOCK_S, _SIGMAS = 2e-3, 4.0
 """Cameras whose delays differ by no more, or by no more deviations, have one clock."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Correction:
-    """A corrected calibration, and what has changed in it or must be changed elsewhere."""
-
-    device: RecordedSensors
-    notes: tuple[str, ...]
-
-
-def correct(diagnosis: doctor.Diagnosis) -> Correction:
-    """Return the calibration of a recording with what its diagnosis shows to be off.
+def correct(diagnosis: doctor.Diagnosis) -> tuple[RecordedSensors, tuple[str, ...]]:
+    """Return the sensors with what a diagnosis shows to be off, and what has changed or is to be changed.
 
     Units and axes are of the samples, not of the calibration: they are only told.
     """
@@ -46,7 +38,7 @@ def correct(diagnosis: doctor.Diagnosis) -> Correction:
             device, sensors=dataclasses.replace(device.sensors, sensors=known)
         )
         notes += [*told, *also]
-    return Correction(device, tuple(notes) or ("nothing to correct",))
+    return device, tuple(notes) or ("nothing to correct",)
 
 
 def _verdicts(diagnosis: doctor.Diagnosis, beginning: str) -> list[Finding]:

@@ -7,12 +7,11 @@ import numpy as np
 
 from maplab_py.algorithms.recording_check import image_checks, inertial_checks, stereo, turn_checks
 from maplab_py.algorithms.recording_check.findings import (
+    Check,
     Finding,
     RecordingCheck,
     Verdict,
     cause,
-    ok,
-    unknown,
 )
 from maplab_py.algorithms.recording_check.rates import CameraTurns, analyse_camera
 from maplab_py.algorithms.recording_check.signals import Signals, read_signals
@@ -68,7 +67,7 @@ def diagnose_signals(
     findings = list(check_times(signals, stream, is_whole=is_whole))
     if cannot_work(signals, is_whole=is_whole):
         return Diagnosis(signals, tuple(findings), ())
-    cameras = tuple(analyse_camera(signals, row) for row in range(len(signals.cameras)))
+    cameras = _analyse_cameras(signals)
     findings += image_checks.check_images(signals)
     findings += [*_check_motion(signals, cameras), *_check_noise(signals, cameras)]
     return Diagnosis(signals, tuple(findings), cameras)
@@ -138,17 +137,18 @@ def map_findings(vi_map: VIMap) -> tuple[Finding, ...]:
         return ()
     if cannot_work(signals, is_whole=True):
         return ()
-    cameras = tuple(analyse_camera(signals, row) for row in range(len(signals.cameras)))
-    return tuple(_check_motion(signals, cameras))
+    return tuple(_check_motion(signals, _analyse_cameras(signals)))
+
+
+def _analyse_cameras(signals: Signals) -> tuple[CameraTurns, ...]:
+    return tuple(analyse_camera(signals, row) for row in range(len(signals.cameras)))
 
 
 def _check_motion(signals: Signals, cameras: Sequence[CameraTurns]) -> Iterator[Finding]:
     """Yield findings on the IMU, and on the cameras against it."""
     first = cameras[0]
     quiet = inertial_checks.measured_quiet(signals)
-    accel = signals.imu.accel_gyro[:, :3] * (
-        inertial_checks.accel_unit(quiet) if quiet is not None else 1.0
-    )
+    accel = signals.imu.accel_gyro[:, :3] * inertial_checks.accel_unit(quiet)
     yield from inertial_checks.check_magnitude(signals, quiet)
     alone = None if first.agrees else inertial_checks.check_gyro_alone(signals)
     yield alone if alone is not None else turn_checks.check_agreement(first)
@@ -173,7 +173,7 @@ def _check_noise(signals: Signals, cameras: Sequence[CameraTurns]) -> Iterator[F
     """Yield findings on the noise figures of the IMU."""
     if signals.device.imu is not None:
         quiet = inertial_checks.measured_quiet(signals)
-        units = (inertial_checks.accel_unit(quiet) if quiet is not None else 1.0, cameras[0].unit)
+        units = inertial_checks.accel_unit(quiet), cameras[0].unit
         yield from inertial_checks.check_noise(signals.device.imu, quiet, units)
 
 
@@ -192,31 +192,31 @@ def _check_stereo(
 ) -> Iterator[Finding]:
     """Yield a finding on the first and each other camera that see the same."""
     for row, fit in enumerate(fits, start=1):
-        check, expected = f"cameras 0 and {row}", f"points {_STEREO_PX:g} px from epipolar lines"
+        check = Check(f"cameras 0 and {row}", f"points {_STEREO_PX:g} px from epipolar lines")
         if fit is None:
-            yield unknown(check, "too few points that both see", expected)
+            yield check.unknown("too few points that both see")
             continue
         observed = f"{fit.as_is:.2f} px at the median of {fit.points} points"
         if fit.as_is <= _STEREO_PX:
-            yield ok(check, observed, expected)
+            yield check.ok(observed)
         elif fit.swapped < _SWAPPED_SHARE * fit.as_is and fit.swapped < 2.0 * _STEREO_PX:
             observed += f", {fit.swapped:.2f} px with the cameras exchanged"
             remedy = (
                 "exchange the images or topics of the cameras, or their entries in the calibration"
             )
-            yield Finding(check, observed, expected, Verdict.WRONG, remedy)
+            yield check.wrong(observed, remedy)
         elif fit.moved < _FITS_PX:
             observed += f", {fit.moved:.2f} px with camera {row} turned by {fit.turn_deg:.1f} deg"
             errors = [float(np.linalg.norm(cameras[c].mounting_error)) for c in (0, row)]
             # the gyroscope contradicts its mounting more
             which = 0 if errors[0] > errors[1] else row
             remedy = f"the extrinsics of camera {which} (T_B_C, kalibr: T_cn_cnm1): calibrate the rig again"
-            yield Finding(check, observed, expected, Verdict.WRONG, remedy)
+            yield check.wrong(observed, remedy)
         else:
             observed += f", {fit.moved:.2f} px whatever their poses"
             which = _unlike_camera(cameras, row)
             remedy = f"the intrinsics or distortion of camera {which}: calibrate it again"
-            yield Finding(check, observed, expected, Verdict.WRONG, remedy)
+            yield check.wrong(observed, remedy)
 
 
 def _unlike_camera(cameras: Sequence[CameraTurns], row: int) -> int:

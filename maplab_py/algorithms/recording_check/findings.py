@@ -45,14 +45,32 @@ class Finding:
         return f"{text}: {self.remedy}" if self.remedy else text
 
 
-def ok(check: str, observed: str, expected: str) -> Finding:
-    """Return a finding with which all is well."""
-    return Finding(check, observed, expected, Verdict.OK)
+@dataclasses.dataclass(frozen=True)
+class Check:
+    """A check and what it expects, of which the finding follows from what is observed."""
 
+    name: str
+    expected: str
 
-def unknown(check: str, reason: str, expected: str) -> Finding:
-    """Return a finding on what the recording does not show, with the reason."""
-    return Finding(check, reason, expected, Verdict.UNKNOWN)
+    def ok(self, observed: str) -> Finding:
+        """Return that all is well."""
+        return Finding(self.name, observed, self.expected, Verdict.OK)
+
+    def unknown(self, reason: str) -> Finding:
+        """Return that the recording does not show it."""
+        return Finding(self.name, reason, self.expected, Verdict.UNKNOWN)
+
+    def note(self, observed: str, remedy: str) -> Finding:
+        """Return what works, but could be better."""
+        return Finding(self.name, observed, self.expected, Verdict.NOTE, remedy)
+
+    def wrong(self, observed: str, remedy: str) -> Finding:
+        """Return what is wrong."""
+        return Finding(self.name, observed, self.expected, Verdict.WRONG, remedy)
+
+    def hopeless(self, observed: str, remedy: str) -> Finding:
+        """Return why no map can be made."""
+        return Finding(self.name, observed, self.expected, Verdict.HOPELESS, remedy)
 
 
 def cause(findings: Sequence[Finding]) -> Finding | None:

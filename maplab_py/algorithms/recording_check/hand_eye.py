@@ -46,13 +46,10 @@ class RateMap:
     """Linear map of the gyroscope's rates to those of the images, in the IMU's frame."""
 
     A: F64  # (3, 3) image = A gyroscope + c
-    A_sigma: F64  # (3, 3)
     c: F64  # (3,) [rad/s]
     scatter: F64  # (3, 3) of the gyroscope's rates: what the map is known from
     delay_s: float  # images were taken so much after their stamps
     explained: float  # share of the variance of the images' turns
-    explained_at_zero: float  # without a delay
-    pairs: int
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -69,7 +66,6 @@ class HandEye:
     readout_s: float  # from the first row of an image to its last
     readout_sigma_s: float
     error_px: float  # median distance to the epipolar planes
-    pairs: int
 
 
 def fit_rates(turns: ImageTurns, rays: RayPairs, gyro: GyroTurns, R_I_C: F64) -> RateMap | None:
@@ -84,18 +80,13 @@ def fit_rates(turns: ImageTurns, rays: RayPairs, gyro: GyroTurns, R_I_C: F64) ->
     near = np.arange(-_NEAR_S, _NEAR_S + 1e-9, _STEP_S)
     shares = _explained(image, rays, gyro, near)
     delay_s, best = float(near[np.argmax(shares)]), float(shares.max())
-    at_zero = float(shares[len(near) // 2])
     if best < _AGREES:
         span_s = float(rays.second_ns[-1] - rays.first_ns[0]) * 1e-9
         far = np.arange(-0.5 * span_s, 0.5 * span_s, _FAR_STEP_S)
         far_shares = _explained(image, rays, gyro, far)
         if far_shares.max() > best + 0.2:
-            delay_s, best = float(far[np.argmax(far_shares)]), float(far_shares.max())
-    fitted = _linear(image, rays, gyro, delay_s)
-    if fitted is None:
-        return None
-    A, sigma, c, scatter, explained, pairs = fitted
-    return RateMap(A, sigma, c, scatter, delay_s, explained, at_zero, pairs)
+            delay_s = float(far[np.argmax(far_shares)])
+    return _linear(image, rays, gyro, delay_s)
 
 
 def _explained(image: F64, rays: RayPairs, gyro: GyroTurns, delays_s: F64) -> F64:
@@ -103,14 +94,14 @@ def _explained(image: F64, rays: RayPairs, gyro: GyroTurns, delays_s: F64) -> F6
     shares = np.zeros(len(delays_s))
     for row, delay_s in enumerate(delays_s.tolist()):
         fitted = _linear(image, rays, gyro, delay_s, rounds=2)
-        shares[row] = fitted[4] if fitted is not None else 0.0
+        shares[row] = fitted.explained if fitted is not None else 0.0
     return shares
 
 
 def _linear(
     image: F64, rays: RayPairs, gyro: GyroTurns, delay_s: float, rounds: int = _LINEAR_ROUNDS
-) -> tuple[F64, F64, F64, F64, float, int] | None:
-    """Regress the images' turns (P, 3) on those of the gyroscope; see `RateMap`."""
+) -> RateMap | None:
+    """Regress the images' turns (P, 3) on those of the gyroscope at a delay."""
     inside = gyro.covers(rays.first_ns, rays.second_ns, delay_s)
     if np.count_nonzero(inside) < max(_LEAST_PAIRS, len(image) // 3):
         return None
@@ -131,12 +122,9 @@ def _linear(
     left = float(np.sum(W * (Y - X @ solution) ** 2))
     mean = np.sum(W * Y, axis=0) / max(float(weight.sum()), 1e-12)
     total = float(np.sum(W * (Y - mean) ** 2))
-    variance = np.sum(W * (Y - X @ solution) ** 2, axis=0) / max(float(weight.sum()) - 4.0, 1.0)
-    covariance = np.linalg.inv(X.T @ (W * X) + 1e-9 * np.eye(4))
-    sigma = np.sqrt(variance[:, None] * np.diagonal(covariance)[None, :3])
     off = X[:, :3] - np.sum(W * X[:, :3], axis=0) / max(float(weight.sum()), 1e-12)
-    share = 1.0 - left / max(total, 1e-12)
-    return solution[:3].T, sigma.T, solution[3], off.T @ (W * off), share, len(Y)
+    explained = 1.0 - left / max(total, 1e-12)
+    return RateMap(solution[:3].T, solution[3], off.T @ (W * off), delay_s, explained)
 
 
 def fit_hand_eye(
@@ -197,7 +185,6 @@ def fit_hand_eye(
         float(x[8]),
         float(sigma[8]),
         error_px,
-        len(rays),
     )
 
 

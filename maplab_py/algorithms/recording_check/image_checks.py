@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from maplab_py.algorithms.recording_check.findings import Finding, Verdict, ok
+from maplab_py.algorithms.recording_check.findings import Check, Finding
 from maplab_py.algorithms.recording_check.signals import CameraSignal, Signals
 from maplab_py.algorithms.recording_check.turns import GyroTurns
 
@@ -22,13 +22,9 @@ def check_images(signals: Signals) -> Iterator[Finding]:
     """Yield findings on the images of every camera."""
     for row, camera in enumerate(signals.cameras):
         if camera.damaged:
-            yield Finding(
-                f"files of camera {row}",
-                f"{camera.damaged} of the images looked at are damaged",
-                "images that can be decoded",
-                Verdict.WRONG,
-                signals.damage,
-            )
+            check = Check(f"files of camera {row}", "images that can be decoded")
+            observed = f"{camera.damaged} of the images looked at are damaged"
+            yield check.wrong(observed, signals.damage)
         if len(camera.figures) >= _LEAST_FIGURES:
             yield _check_change(signals, row)
             yield _check_light(row, camera)
@@ -37,7 +33,7 @@ def check_images(signals: Signals) -> Iterator[Finding]:
 
 
 def _check_change(signals: Signals, row: int) -> Finding:
-    check, expected = f"change of camera {row}", "every image is new"
+    check = Check(f"change of camera {row}", "every image is new")
     figures = signals.cameras[row].figures
     times_ns = np.array([figure.time_ns for figure in figures], dtype=np.int64)
     is_repeated = np.array([figure.is_repeated for figure in figures])[1:]
@@ -48,38 +44,35 @@ def _check_change(signals: Signals, row: int) -> Finding:
         moves = np.linalg.norm(gyro.phi(times_ns[:-1], times_ns[1:]), axis=1) > _LEAST_TURN_RAD
     count = int(np.count_nonzero(moves))
     if count < _LEAST_FIGURES:
-        return ok(check, "the device rests", expected)
+        return check.ok("the device rests")
     share = float(np.mean(is_repeated[moves]))
     observed = f"{share:.0%} are the image before again, though the device turns"
     if share > _FROZEN:
-        remedy = "the camera or its driver hung: record again"
-        return Finding(check, observed, expected, Verdict.HOPELESS, remedy)
+        return check.hopeless(observed, "the camera or its driver hung: record again")
     if share > _REPEATED:
-        remedy = "let the driver write each image once, with its own stamp"
-        return Finding(check, observed, expected, Verdict.WRONG, remedy)
-    return ok(check, "images change", expected)
+        return check.wrong(observed, "let the driver write each image once, with its own stamp")
+    return check.ok("images change")
 
 
 def _check_light(row: int, camera: CameraSignal) -> Finding:
-    check, expected = f"light of camera {row}", "grey values within the range"
+    check = Check(f"light of camera {row}", "grey values within the range")
     grey, dark, bright = (
         float(np.median([getattr(figure, name) for figure in camera.figures]))
         for name in ("mean_grey", "dark_share", "bright_share")
     )
     observed = f"mean {grey:.0f} of 255, {dark:.0%} black, {bright:.0%} white"
     if bright > _BRIGHT_SHARE:
-        remedy = "over-exposed: shorten the exposure or lower the gain"
-        return Finding(check, observed, expected, Verdict.WRONG, remedy)
+        return check.wrong(observed, "over-exposed: shorten the exposure or lower the gain")
     if grey < _DARK_GREY or dark > _DARK_SHARE:
         remedy = (
             "under-exposed: more light, more gain, or --image_bits if the values have fewer bits"
         )
-        return Finding(check, observed, expected, Verdict.WRONG, remedy)
-    return ok(check, observed, expected)
+        return check.wrong(observed, remedy)
+    return check.ok(observed)
 
 
 def _check_texture(row: int, camera: CameraSignal) -> Finding:
-    check, expected = f"texture of camera {row}", f"{_FEW_CORNERS} corners or more"
+    check = Check(f"texture of camera {row}", f"{_FEW_CORNERS} corners or more")
     corners = np.array([figure.corners for figure in camera.figures])
     poor = float(np.mean(corners < _FEW_CORNERS))
     observed = (
@@ -87,21 +80,20 @@ def _check_texture(row: int, camera: CameraSignal) -> Finding:
     )
     if np.median(corners) < _LEAST_CORNERS:
         remedy = "look at furniture and edges rather than at bare walls, floor or sky"
-        return Finding(check, observed, expected, Verdict.WRONG, remedy)
+        return check.wrong(observed, remedy)
     if poor > 0.25:
-        remedy = "keep bare walls out of the image; a wider lens helps"
-        return Finding(check, observed, expected, Verdict.NOTE, remedy)
-    return ok(check, observed, expected)
+        return check.note(observed, "keep bare walls out of the image; a wider lens helps")
+    return check.ok(observed)
 
 
 def _check_sharpness(row: int, camera: CameraSignal) -> Finding:
-    check, expected = f"sharpness of camera {row}", f"{_BLURRED:.0%} or more"
+    check = Check(f"sharpness of camera {row}", f"{_BLURRED:.0%} or more")
     values = [figure.sharpness for figure in camera.figures if figure.corners >= _LEAST_CORNERS]
     if len(values) < _LEAST_FIGURES:
-        return Finding(check, "too few edges to tell", expected, Verdict.UNKNOWN)
+        return check.unknown("too few edges to tell")
     sharp = float(np.median(values))
     observed = f"{sharp:.0%} of an edge's contrast are in its steepest pixel"
     if sharp < _BLURRED:
         remedy = "out of focus or blurred by motion: focus the lens, expose for less than 10 ms"
-        return Finding(check, observed, expected, Verdict.NOTE, remedy)
-    return ok(check, observed, expected)
+        return check.note(observed, remedy)
+    return check.ok(observed)

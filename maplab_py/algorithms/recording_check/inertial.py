@@ -31,7 +31,6 @@ class QuietImu:
     accel_norm: float  # [unit of the recording]
     mean_norm: float  # of all samples
     is_at_rest: bool  # some second is as quiet as only a device at rest is
-    gyro: F64  # (3,) mean rate
     accel_density: float  # Allan deviation, as white noise [unit / sqrt(Hz)]
     gyro_density: float
 
@@ -61,7 +60,6 @@ def quiet_figures(times_ns: I64, accel_gyro: F64) -> QuietImu | None:
         float(np.median(np.linalg.norm(stretch[quiet, :, :3].mean(axis=1), axis=1))),
         mean,
         bool(np.any(at_rest & (gyro[quiet] < _REST_GYRO))),
-        np.asarray(np.median(stretch[quiet, :, 3:].mean(axis=1), axis=0)),
         float(np.median(density[_quietest(density[:, 0]), 0])),
         float(np.median(density[_quietest(density[:, 1]), 1])),
     )
@@ -146,7 +144,6 @@ class AccelSign:
 
     score: float  # from -1, the accelerometer has the opposite sign, to 1
     sigma: float
-    windows: int
 
 
 def fit_accel_sign(
@@ -206,7 +203,7 @@ def fit_accel_sign(
     score, weight = np.array(scores), np.array(weights)
     mean = float(np.sum(weight * score) / np.sum(weight))
     spread = np.sqrt(np.sum(weight**2 * (score - mean) ** 2)) / np.sum(weight)
-    return AccelSign(mean, max(float(spread), 0.05), len(scores))
+    return AccelSign(mean, max(float(spread), 0.05))
 
 
 def _speeds(direction: F64, since_s: F64, dv: F64) -> F64:

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from maplab_py.algorithms.recording_check import inertial, rates
-from maplab_py.algorithms.recording_check.findings import Finding, Verdict, ok, unknown
+from maplab_py.algorithms.recording_check.findings import Check, Finding
 from maplab_py.algorithms.recording_check.signals import Signals
 from maplab_py.array_types import F64
 from maplab_py.sensors import Imu
@@ -31,8 +31,10 @@ _FASTEST_RADPS = 12.0
 _SIGN_SCORE = 0.6
 
 
-def accel_unit(quiet: inertial.QuietImu) -> float:
-    """Return the m/s^2 that the unit of the accelerometer is."""
+def accel_unit(quiet: inertial.QuietImu | None) -> float:
+    """Return the m/s^2 that the unit of the accelerometer is; 1 where it is not known."""
+    if quiet is None:
+        return 1.0
     size = max(quiet.accel_norm, 1e-9)
     unit = min(_ACCEL_UNITS, key=lambda known: abs(np.log(size * known / GRAVITY)))
     return unit if abs(size * unit / GRAVITY - 1.0) < _UNIT_TOLERANCE else 1.0
@@ -47,10 +49,10 @@ def check_magnitude(signals: Signals, quiet: inertial.QuietImu | None) -> Iterat
     ):
         if len(values) and not np.any(part):
             remedy = "--imu_topic=GYRO,ACCEL joins the topics of gyroscope and accelerometer"
-            yield Finding(name, "all values are 0", unit, Verdict.HOPELESS, remedy)
-    check, expected = "unit of the accelerometer", f"{GRAVITY:g} m/s^2 at rest"
+            yield Check(name, unit).hopeless("all values are 0", remedy)
+    check = Check("unit of the accelerometer", f"{GRAVITY:g} m/s^2 at rest")
     if quiet is None:
-        yield unknown(check, "less than a second of samples", expected)
+        yield check.unknown("less than a second of samples")
         return
     where = "at rest" if quiet.is_at_rest else "in the quietest seconds"
     observed = f"{quiet.accel_norm:.4g} {where}, {quiet.mean_norm:.4g} at the median"
@@ -58,25 +60,24 @@ def check_magnitude(signals: Signals, quiet: inertial.QuietImu | None) -> Iterat
     off = abs(quiet.accel_norm * unit_mps2 / GRAVITY - 1.0)
     if unit_mps2 != 1.0:
         remedy = f"the unit is {_ACCEL_UNITS[unit_mps2]}: multiply accelerations by {unit_mps2:.6g}"
-        yield Finding(check, observed, expected, Verdict.WRONG, remedy)
+        yield check.wrong(observed, remedy)
     elif 0.0 < quiet.mean_norm < _WITHOUT_GRAVITY_MPS2:
         remedy = "gravity was removed: record the accelerometer itself, not linear acceleration"
-        yield Finding(check, observed, expected, Verdict.WRONG, remedy)
+        yield check.wrong(observed, remedy)
     elif off >= _UNIT_TOLERANCE:
         remedy = "scale the accelerations, or calibrate the accelerometer (T_a)"
-        yield Finding(check, observed, expected, Verdict.WRONG, remedy)
+        yield check.wrong(observed, remedy)
     elif off > _NOTED:
         remedy = (
             "a large bias or scale error: let it rest in several attitudes and calibrate it (T_a)"
         )
-        yield Finding(check, observed, expected, Verdict.NOTE, remedy)
+        yield check.note(observed, remedy)
     else:
-        yield ok(check, observed, expected)
+        yield check.ok(observed)
     share = float(np.mean(signals.imu.is_saturated)) if len(signals.imu) else 0.0
     if share > 0.001:
         remedy = "a larger range of the IMU, or slower motion"
-        observed = f"{share:.1%} of the samples"
-        yield Finding("saturation", observed, "none", Verdict.NOTE, remedy)
+        yield Check("saturation", "none").note(f"{share:.1%} of the samples", remedy)
 
 
 def check_gyro_alone(signals: Signals) -> Finding | None:
@@ -86,32 +87,28 @@ def check_gyro_alone(signals: Signals) -> Finding | None:
     rate = float(np.median(np.linalg.norm(signals.imu.accel_gyro[:, 3:], axis=1)))
     if rate < _FASTEST_RADPS:
         return None
-    return Finding(
-        "unit of the gyroscope",
-        f"{rate:.3g} at the median",
-        f"below {_FASTEST_RADPS:g} rad/s",
-        Verdict.WRONG,
-        f"the unit is deg/s: multiply rates by {np.pi / 180.0:.7g}",
-    )
+    remedy = f"the unit is deg/s: multiply rates by {np.pi / 180.0:.7g}"
+    check = Check("unit of the gyroscope", f"below {_FASTEST_RADPS:g} rad/s")
+    return check.wrong(f"{rate:.3g} at the median", remedy)
 
 
 def check_accel_axes(
-    signals: Signals, accel: F64, camera: rates.CameraTurns | None
+    signals: Signals, accel: F64, camera: rates.CameraTurns
 ) -> tuple[Finding, bool]:
     """Return a finding on the axes of the accelerometer, and whether they are those of the gyroscope."""
-    check = "axes of the accelerometer"
     expected = "gravity stays where it is while the gyroscope turns"
-    if camera is None or camera.gyro is None:
-        return unknown(check, "no images to know the gyroscope's bias from", expected), False
+    check = Check("axes of the accelerometer", expected)
+    if camera.gyro is None:
+        return check.unknown("no images to know the gyroscope's bias from"), False
     fit = inertial.fit_accel_axes(signals.imu.times_ns, accel, camera.gyro.shifted(-camera.bias))
     if fit is None:
-        return unknown(check, "the recording is too short", expected), False
+        return check.unknown("the recording is too short"), False
     observed = f"its direction spreads by {np.degrees(fit.as_is):.1f} deg"
     if fit.as_is > _DISAGREE * fit.spread and fit.as_is - fit.spread > _LEAST_SPREAD:
         observed += f", {np.degrees(fit.spread):.1f} deg with {axes_text(fit.B)}"
         remedy = f"exchange the axes of the accelerometer: (x, y, z) = {axes_text(fit.B)}, or all opposite"
-        return Finding(check, observed, expected, Verdict.WRONG, remedy), False
-    return ok(check, observed, expected), True
+        return check.wrong(observed, remedy), False
+    return check.ok(observed), True
 
 
 def raw_axes_agree(signals: Signals, accel: F64, camera: rates.CameraTurns) -> bool | None:
@@ -133,26 +130,21 @@ def raw_axes_agree(signals: Signals, accel: F64, camera: rates.CameraTurns) -> b
     return spread < exchanged
 
 
-def check_accel_sign(signals: Signals, accel: F64, camera: rates.CameraTurns | None) -> Finding:
+def check_accel_sign(signals: Signals, accel: F64, camera: rates.CameraTurns) -> Finding:
     """Return a finding on the sign of the accelerometer."""
-    check, expected = "sign of the accelerometer", "+g upwards at rest"
-    if camera is None or camera.gyro is None or camera.hand_eye is None:
-        return unknown(check, "no turn of images to compare with", expected)
+    check = Check("sign of the accelerometer", "+g upwards at rest")
+    if camera.gyro is None or camera.hand_eye is None:
+        return check.unknown("no turn of images to compare with")
     pose = camera.hand_eye.R_I_C, signals.device.T_I_C[0, 4:]
     gyro = camera.gyro.shifted(-camera.bias)
     rays = camera.rays.later(camera.hand_eye.delay_s)
     fit = inertial.fit_accel_sign(camera.turns, rays, gyro, accel, signals.imu.times_ns, pose)
     if fit is None or abs(fit.score) < max(_SIGN_SCORE, 4.0 * fit.sigma):
-        return unknown(check, "too little acceleration to tell", expected)
+        return check.unknown("too little acceleration to tell")
     if fit.score > 0.0:
-        return ok(check, "accelerations fit the motion of the images", expected)
-    return Finding(
-        check,
-        "accelerations are opposite to the motion of the images",
-        expected,
-        Verdict.WRONG,
-        "change the sign of all accelerations",
-    )
+        return check.ok("accelerations fit the motion of the images")
+    observed = "accelerations are opposite to the motion of the images"
+    return check.wrong(observed, "change the sign of all accelerations")
 
 
 def check_noise(
@@ -167,21 +159,19 @@ def check_noise(
         ("gyroscope", "gyro_noise_density", imu.gyro_noise_density,
          quiet.gyro_density * units[1], "rad/s/sqrt(Hz)"),
     ):  # fmt: skip
-        check = f"noise of the {name}"
-        observed, expected = f"{measured:.2g} {unit}", f"{given:.2g} as the calibration says"
+        check = Check(f"noise of the {name}", f"{given:.2g} as the calibration says")
+        observed = f"{measured:.2g} {unit}"
         remedy = f"{key}: {measured:.2g} in the calibration, or --vio_imu_noise=auto"
         if given > _TOO_LARGE * measured:
-            remedy = f"the figure is too large: {remedy}"
-            yield Finding(check, observed, expected, Verdict.WRONG, remedy)
+            yield check.wrong(observed, f"the figure is too large: {remedy}")
         elif not quiet.is_at_rest and measured > given:
-            yield unknown(check, f"{observed} at most: it never rests", expected)
+            yield check.unknown(f"{observed} at most: it never rests")
         elif measured > _TOO_SMALL * given:
-            remedy = f"the figure is too small: {remedy}"
-            yield Finding(check, observed, expected, Verdict.WRONG, remedy)
+            yield check.wrong(observed, f"the figure is too small: {remedy}")
         elif given > _LARGE * measured:
-            yield Finding(check, observed, expected, Verdict.NOTE, f"larger than needed: {remedy}")
+            yield check.note(observed, f"larger than needed: {remedy}")
         else:
-            yield ok(check, observed, expected)
+            yield check.ok(observed)
 
 
 def measured_quiet(signals: Signals) -> inertial.QuietImu | None:

@@ -112,13 +112,12 @@ def mended(
         imu = diagnosis.signals.imu
         imu = dataclasses.replace(imu, accel_gyro=read.mend(imu.accel_gyro))
         diagnosis = doctor.diagnose_signals(dataclasses.replace(diagnosis.signals, imu=imu), stream)
-    corrected = correction.correct(diagnosis)
-    if corrected.device is diagnosis.signals.device:
-        words = read.words
-    else:
-        words = (*read.words, *(n for n in corrected.notes if not n.startswith("not of the")))
-    words = tuple(word for word in words if word != "nothing to correct")
-    return dataclasses.replace(read, device=corrected.device, words=words) if words else None
+    device, notes = correction.correct(diagnosis)
+    words = read.words
+    if device is not diagnosis.signals.device:
+        told = ("not of the calibration", "nothing to correct")
+        words += tuple(note for note in notes if not note.startswith(told))
+    return dataclasses.replace(read, device=device, words=words) if words else None
 
 
 def _with_samples(recording: protocol.Recording, diagnosis: doctor.Diagnosis) -> MendedRecording:
@@ -126,7 +125,7 @@ def _with_samples(recording: protocol.Recording, diagnosis: doctor.Diagnosis) ->
     signals, first = diagnosis.signals, diagnosis.cameras[0]
     accel, gyro, words = np.eye(3), np.eye(3), []
     quiet = inertial_checks.measured_quiet(signals)
-    unit = inertial_checks.accel_unit(quiet) if quiet is not None else 1.0
+    unit = inertial_checks.accel_unit(quiet)
     wrong = {f.check: f for f in diagnosis.findings if f.verdict is findings.Verdict.WRONG}
     if "unit of the accelerometer" in wrong and unit != 1.0:
         accel = unit * accel

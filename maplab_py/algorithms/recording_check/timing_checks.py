@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from maplab_py.algorithms.recording_check.findings import Finding, Verdict, ok
+from maplab_py.algorithms.recording_check.findings import Check, Finding, Verdict
 from maplab_py.algorithms.recording_check.signals import Signals
 from maplab_py.interop.recordings.options import StreamOptions
 from maplab_py.interop.recordings.summary import nearest_apart_ns
@@ -25,13 +25,8 @@ def check_times(signals: Signals, stream: StreamOptions, *, is_whole: bool) -> I
         is_whole: The recording was read to its end.
     """
     if signals.restart:
-        yield Finding(
-            "clock",
-            "starts again",
-            "increasing stamps",
-            Verdict.WRONG,
-            "read one part: --recording_part=N (recording_info lists them)",
-        )
+        remedy = "read one part: --recording_part=N (recording_info lists them)"
+        yield Check("clock", "increasing stamps").wrong("starts again", remedy)
     yield _check_spans(signals, is_whole)
     if len(signals.imu) > 1:
         yield from _check_imu_rate(signals, stream)
@@ -47,64 +42,60 @@ def cannot_work(signals: Signals, *, is_whole: bool) -> bool:
 
 
 def _check_spans(signals: Signals, is_whole: bool) -> Finding:
-    check, expected = "IMU and images", "samples while there are images"
+    check = Check("IMU and images", "samples while there are images")
     images = [camera.times_ns for camera in signals.cameras if len(camera.times_ns)]
     if not len(signals.imu):
         remedy = "name its topic (--imu_topic) or its file; rovioli needs an IMU"
-        return Finding(check, "no IMU samples", expected, Verdict.HOPELESS, remedy)
+        return check.hopeless("no IMU samples", remedy)
     if not images:
         remedy = "name their topics (--camera_topics), or give another folder"
-        return Finding(check, "no images", expected, Verdict.HOPELESS, remedy)
+        return check.hopeless("no images", remedy)
     first, last = int(signals.imu.times_ns[0]), int(signals.imu.times_ns[-1])
     begin, end = min(int(t[0]) for t in images), max(int(t[-1]) for t in images)
     if last < begin or first > end:
         apart_s = max(begin - last, first - end) * 1e-9
-        observed = f"no time in common, {apart_s:.4g} s apart"
-        return Finding(check, observed, expected, Verdict.HOPELESS, _CLOCKS)
+        return check.hopeless(f"no time in common, {apart_s:.4g} s apart", _CLOCKS)
     if not is_whole:
-        return ok(check, "overlap", expected)
+        return check.ok("overlap")
     times = images[0]
     share = float(np.mean((times >= first) & (times <= last)))
     observed = f"samples for {share:.0%} of the images"
     if share < _LEAST_SHARED:
-        return Finding(check, observed, expected, Verdict.WRONG, _CLOCKS)
-    return ok(check, observed, expected)
+        return check.wrong(observed, _CLOCKS)
+    return check.ok(observed)
 
 
 def _check_imu_rate(signals: Signals, stream: StreamOptions) -> Iterator[Finding]:
     steps_s = np.diff(signals.imu.times_ns) * 1e-9
     rate_hz = signals.imu.rate_hz
-    observed, expected = f"{rate_hz:.4g} Hz", f"{_LEAST_IMU_HZ:g} Hz or more"
+    check, observed = Check("rate of the IMU", f"{_LEAST_IMU_HZ:g} Hz or more"), f"{rate_hz:.4g} Hz"
     if rate_hz < _LEAST_IMU_HZ:
         remedy = "set the driver to a higher rate; slow motion only with this one"
-        yield Finding("rate of the IMU", observed, expected, Verdict.NOTE, remedy)
+        yield check.note(observed, remedy)
     else:
-        yield ok("rate of the IMU", observed, expected)
+        yield check.ok(observed)
     gaps, largest = int(np.count_nonzero(steps_s > stream.imu_gap_s)), float(steps_s.max())
-    expected = f"none above {stream.imu_gap_s:g} s"
+    check = Check("gaps of the IMU", f"none above {stream.imu_gap_s:g} s")
     if not gaps:
-        yield ok("gaps of the IMU", f"largest {largest:.3g} s", expected)
+        yield check.ok(f"largest {largest:.3g} s")
         return
     at_s = (int(signals.imu.times_ns[np.argmax(steps_s)]) - signals.start_ns) * 1e-9
     missing = float(steps_s[steps_s > stream.imu_gap_s].sum()) / max(signals.duration_s, 1e-9)
     observed = f"{gaps}, the largest of {largest:.3g} s at {at_s:.2f} s"
-    verdict = Verdict.WRONG if missing > 0.05 else Verdict.NOTE
-    remedy = "record again with a faster disk or a larger queue"
-    yield Finding("gaps of the IMU", observed, expected, verdict, remedy)
+    judge = check.wrong if missing > 0.05 else check.note
+    yield judge(observed, "record again with a faster disk or a larger queue")
 
 
 def _check_images(signals: Signals, row: int) -> Finding:
     steps_s = np.diff(signals.cameras[row].times_ns) * 1e-9
     usual, largest = float(np.median(steps_s)), float(steps_s.max())
-    check, expected = f"rate of camera {row}", f"{_LEAST_IMAGE_HZ:g} Hz or more, no holes"
+    check = Check(f"rate of camera {row}", f"{_LEAST_IMAGE_HZ:g} Hz or more, no holes")
     observed = f"{1.0 / max(usual, 1e-9):.4g} Hz, longest step {largest:.3g} s"
     if 1.0 / max(usual, 1e-9) < _LEAST_IMAGE_HZ:
-        remedy = "record more images a second, or move slowly"
-        return Finding(check, observed, expected, Verdict.NOTE, remedy)
+        return check.note(observed, "record more images a second, or move slowly")
     if largest > max(_HOLE_S, 10.0 * usual):
-        remedy = "images were lost: record with a faster disk, or raw images"
-        return Finding(check, observed, expected, Verdict.NOTE, remedy)
-    return ok(check, observed, expected)
+        return check.note(observed, "images were lost: record with a faster disk, or raw images")
+    return check.ok(observed)
 
 
 def _check_partners(signals: Signals, stream: StreamOptions) -> Iterator[Finding]:
@@ -113,11 +104,12 @@ def _check_partners(signals: Signals, stream: StreamOptions) -> Iterator[Finding
     count = sum(len(camera.times_ns) for camera in signals.cameras)
     unmatched = sum(camera.unmatched for camera in signals.cameras)
     tolerance_ns = stream.nframe_sync_tolerance_ns
-    expected = f"images of all cameras within {tolerance_ns * 1e-6:g} ms"
+    within = f"images of all cameras within {tolerance_ns * 1e-6:g} ms"
+    check = Check("partners of images", within)
     share = unmatched / max(count, 1)
     observed = f"{share:.0%} of the images are alone"
     if share <= _UNMATCHED_SHARE:
-        yield ok("partners of images", observed, expected)
+        yield check.ok(observed)
         return
     first, other = (signals.cameras[row].times_ns for row in (0, 1))
     if len(first) and len(other):
@@ -126,4 +118,4 @@ def _check_partners(signals: Signals, stream: StreamOptions) -> Iterator[Finding
         "trigger the cameras together, raise --vio_nframe_sync_tolerance_ns, or read one camera "
         "(--rovio_active_camera_indices=0)"
     )
-    yield Finding("partners of images", observed, expected, Verdict.WRONG, remedy)
+    yield check.wrong(observed, remedy)
