@@ -18,9 +18,9 @@ from maplab_py.algorithms.summary.workflow import WorkflowOptions, make_localiza
 from maplab_py.algorithms.vi_optimization import calibration_choice, optimization
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.errors import Cancelled, EstimationError, MaplabError, UserError
-from maplab_py.frontend.localization import record, reports
+from maplab_py.frontend.localization import record
 from maplab_py.frontend.mapping import Mapping
-from maplab_py.frontend.reports import MappingReport
+from maplab_py.frontend.reports import LocalizationSummary, MappingReport
 from maplab_py.frontend.run_options import OutputOptions
 from maplab_py.interop.trajectories import write_euroc
 from maplab_py.progress import SILENT, Progress
@@ -373,7 +373,7 @@ def _report(
     )
 
 
-def _localization(mapping: Mapping) -> reports.LocalizationSummary | None:
+def _localization(mapping: Mapping) -> LocalizationSummary | None:
     if mapping.localization is None:
         return None
     csv_file = mapping.options.output.export_localized_poses_to_csv

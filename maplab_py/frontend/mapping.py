@@ -15,7 +15,7 @@ from maplab_py.algorithms.recording_check import findings, mending
 from maplab_py.array_types import F64
 from maplab_py.errors import Cancelled, EstimationError, MaplabError, UserError
 from maplab_py.frontend import map_builder, run_options, run_statistics, starting, vertex_keypoints
-from maplab_py.frontend.localization import online, opening, record
+from maplab_py.frontend.localization import online, record
 from maplab_py.frontend.odometry import Odometry
 from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.interop.recordings import protocol, stream
@@ -88,7 +88,7 @@ class Mapping:
         self._keypoints = vertex_keypoints.VertexKeypoints(
             features, self.options.builder.features_every
         )
-        self.localization = opening.opened_localization(localization, device, self.options.odometry)
+        self.localization = online.opened_localization(localization, device, self.options.odometry)
         self.localized = record.LocalizationRecord()
         self.localized_frame: online.LocalizedFrame | None = None
         is_tight = self.localization is not None and localization.mode == "vil"

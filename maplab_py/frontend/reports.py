@@ -3,7 +3,6 @@
 import dataclasses
 from pathlib import Path
 
-from maplab_py.frontend.localization.reports import LocalizationSummary
 from maplab_py.report import Report
 
 
@@ -23,6 +22,26 @@ class EstimatorStart:
     time_s: float  # after the beginning of the recording, as flags count
     waited_s: float  # since the first frame, or since the estimator was lost
     reason: str  # why it had to start
+
+
+@dataclasses.dataclass(frozen=True)
+class LocalizationSummary:
+    """Quality of the localisation of a recording."""
+
+    map_name: str
+    mode: str
+    map_landmarks: int
+    localized_share: float  # of all frames
+    first_localized_s: float | None  # after the first frame; None = never
+    queries: int
+    answers_by_index: int
+    answers_by_tracking: int
+    matches: int
+    starts: int  # of T_G_M
+    disagreeing: int
+    late: int
+    refused: dict[str, int]  # answers of the index, by reason
+    csv_file: Path | None
 
 
 @dataclasses.dataclass(frozen=True)

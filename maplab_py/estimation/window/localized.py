@@ -25,15 +25,12 @@ _LANDMARK_CHI2 = 16.3
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class MapEstimate:
+class MapPose:
     """Pose of the newest frame in the map."""
 
     T_G_M: F64  # (7,)
     T_G_I: F64  # (7,)
     covariance: F64  # (6, 6) of [dp, dtheta] of T_G_I; infinite where it is not determined
-    num_tracks: int  # that observe the map
-    num_observations: int
-    median_error_px: float  # of them; nan without any
 
 
 class LocalizedSmoother(smoother.FixedLagSmoother):
@@ -59,7 +56,7 @@ class LocalizedSmoother(smoother.FixedLagSmoother):
         self._map_rows = self._used  # of these, whose landmarks are states
         self._latest_terms: MapTerms | None = None
         self._checked_terms: MapTerms | None = None  # of the update that has begun
-        self._estimate: MapEstimate | None = None
+        self._pose: MapPose | None = None
 
     @property
     def is_localized(self) -> bool:
@@ -67,9 +64,9 @@ class LocalizedSmoother(smoother.FixedLagSmoother):
         return len(self._states.T_G_M) > 0
 
     @property
-    def map_estimate(self) -> MapEstimate | None:
-        """The result of the last update; None while T_G_M is not a state."""
-        return self._estimate if self.is_localized else None
+    def map_pose(self) -> MapPose | None:
+        """Pose after the last update; None while T_G_M is not a state."""
+        return self._pose if self.is_localized else None
 
     @property
     def map_terms(self) -> MapTerms | None:
@@ -90,7 +87,7 @@ class LocalizedSmoother(smoother.FixedLagSmoother):
         self._prior = self._prior.with_base(T_G_M, sigma)
         none = np.zeros((0, 3))
         self._states = dataclasses.replace(self._states, T_G_M=T_G_M[None], p_G=none)
-        self._estimate = None
+        self._pose = None
 
     def stop_base_frame(self) -> None:
         """Go on without the map."""
@@ -98,7 +95,7 @@ class LocalizedSmoother(smoother.FixedLagSmoother):
         self._prior = self._prior.without_base()
         none = np.zeros((0, 3))
         self._states = dataclasses.replace(self._states, T_G_M=np.zeros((0, 7)), p_G=none)
-        self._estimate = None
+        self._pose = None
 
     def associate(self, matches: map_tracks.MapMatches) -> int:
         """Let whole tracks observe landmarks of the map from the next update on; return how many did.
@@ -173,7 +170,7 @@ class LocalizedSmoother(smoother.FixedLagSmoother):
             joint = problem.covariance_with_base(problem.undamped_near(self._states), newest)
         except NotPositiveDefinite:
             joint = np.full((FRAME_SIZE + 6, FRAME_SIZE + 6), np.inf)
-        self._estimate = self._estimated(joint)
+        self._pose = self._map_pose(joint)
         return joint[:FRAME_SIZE, :FRAME_SIZE]
 
     def _remove_outliers(self, problem: WindowProblem, order: I64) -> float:
@@ -206,25 +203,14 @@ class LocalizedSmoother(smoother.FixedLagSmoother):
         rows = np.searchsorted(tracks.id, self.map_tracks.matches.track_id)
         return np.flatnonzero(tracks.is_seen_by(0)[rows] & ~tracks.is_active[rows])
 
-    def _estimated(self, joint: F64) -> MapEstimate:
-        """Return the estimate, with the covariance (21, 21) of the newest frame and the base frame."""
-        states, terms = self._states, self._latest_terms
-        assert terms is not None  # the problem has them
-        T_M_I, T_G_M = states.T_M_I[-1], states.T_G_M[0]
+    def _map_pose(self, joint: F64) -> MapPose:
+        """Return the pose, with the covariance (21, 21) of the newest frame and the base frame."""
+        T_M_I, T_G_M = self._states.T_M_I[-1], self._states.T_G_M[0]
         covariance = np.full((6, 6), np.inf)
         if np.isfinite(joint).all():
             J, poses = composition_jacobian(T_G_M, T_M_I), np.r_[:6, FRAME_SIZE : FRAME_SIZE + 6]
             covariance = J @ joint[np.ix_(poses, poses)] @ J.T
-        error_px = terms.errors_px(states)
-        seen = np.isfinite(error_px)
-        return MapEstimate(
-            T_G_M=T_G_M,
-            T_G_I=se3.compose(T_G_M, T_M_I),
-            covariance=covariance,
-            num_tracks=len(terms.observations.start) - 1,
-            num_observations=len(terms.observations),
-            median_error_px=float(np.median(error_px[seen])) if seen.any() else float("nan"),
-        )
+        return MapPose(T_G_M, se3.compose(T_G_M, T_M_I), covariance)
 
     def _refuse_contradicted(self, terms: MapTerms) -> None:
         """Give tracks back to the odometry that do not observe their landmark after all."""

@@ -4,14 +4,13 @@ All see the same answers. VIL changes the odometry, the others read it: T_G_I = 
 """
 
 import dataclasses
-from typing import Protocol
 
 import numpy as np
 
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.window.alignment import aligned
-from maplab_py.estimation.window.localized import LocalizedSmoother, composition_jacobian
+from maplab_py.estimation.window.localized import LocalizedSmoother, MapPose, composition_jacobian
 from maplab_py.estimation.window.map_terms import MAP_GATE_CHI2, MapTerms, contradicted_unless_most
 from maplab_py.estimation.window.map_tracks import MapMatches, MapTracks
 from maplab_py.estimation.window.options import MapRule, WindowOptions
@@ -21,96 +20,30 @@ from maplab_py.geometry import se3
 from maplab_py.interop.recordings.protocol import RecordedSensors
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class MapPose:
-    """Pose of the newest frame in the map."""
-
-    T_G_M: F64  # (7,)
-    T_G_I: F64  # (7,)
-    covariance: F64  # (6, 6) of [dp, dtheta] of T_G_I, baselines: given T_M_I; infinite = not known
-
-
-class MapEstimator(Protocol):
-    """Estimates T_G_M from matches."""
-
-    @property
-    def associated(self) -> MapTracks | None:
-        """The tracks that observe the map now; None where matches are not kept."""
-
-    def start(self, T_G_M: F64, smoother: FixedLagSmoother) -> None:
-        """Begin at T_G_M (7,), or begin again there."""
-
-    def add(self, answer: Answer, matches: MapMatches, smoother: FixedLagSmoother) -> None:
-        """Take an answer of a frame; its matches are those that shall be associated."""
-
-    def stop(self, smoother: FixedLagSmoother | None) -> None:
-        """Forget everything; the odometry has started again if there is no smoother."""
-
-    def pose(self, smoother: FixedLagSmoother) -> MapPose | None:
-        """Return where the newest frame is; None while that is not known."""
-
-
-class TightEstimator:
-    """VIL: the smoother has T_G_M among its states."""
-
-    @property
-    def associated(self) -> MapTracks | None:
-        """See `MapEstimator`."""
-        return self._tracks
-
-    def __init__(self) -> None:
-        """Begin without a map."""
-        self._tracks: MapTracks | None = None
-
-    def start(self, T_G_M: F64, smoother: FixedLagSmoother) -> None:
-        """See `MapEstimator`."""
-        localized = _localized(smoother)
-        localized.start_base_frame(T_G_M)
-        self._tracks = localized.map_tracks
-
-    def add(self, answer: Answer, matches: MapMatches, smoother: FixedLagSmoother) -> None:  # noqa: ARG002
-        """See `MapEstimator`."""
-        _localized(smoother).associate(matches)
-
-    def stop(self, smoother: FixedLagSmoother | None) -> None:
-        """See `MapEstimator`."""
-        self._tracks = None
-        if smoother is not None:
-            _localized(smoother).stop_base_frame()
-
-    def pose(self, smoother: FixedLagSmoother) -> MapPose | None:
-        """See `MapEstimator`."""
-        estimate = _localized(smoother).map_estimate
-        if estimate is None:
-            return None
-        return MapPose(estimate.T_G_M, estimate.T_G_I, estimate.covariance)
-
-
-class _LooseEstimator:
-    """Common parts of the estimators that do not change the odometry."""
+class MapEstimator:
+    """Estimates T_G_M from matches; unless a mode does, it does not change the odometry."""
 
     def __init__(self) -> None:
         """Begin without a map."""
         self.T_G_M: F64 | None = None
-        # of T_G_M
-        self.covariance = np.full((6, 6), np.inf)
-
-    @property
-    def associated(self) -> MapTracks | None:
-        """See `MapEstimator`."""
-        return None
+        self.covariance = np.full((6, 6), np.inf)  # of T_G_M
+        self.associated: MapTracks | None = None
+        """The tracks that observe the map now; None where matches are not kept."""
 
     def start(self, T_G_M: F64, smoother: FixedLagSmoother) -> None:  # noqa: ARG002
-        """See `MapEstimator`."""
+        """Begin at T_G_M (7,), or begin again there."""
         self.T_G_M = T_G_M
 
+    def add(self, answer: Answer, matches: MapMatches, smoother: FixedLagSmoother) -> None:
+        """Take an answer of a frame; its matches are those that shall be associated."""
+
     def stop(self, smoother: FixedLagSmoother | None) -> None:  # noqa: ARG002
-        """See `MapEstimator`."""
+        """Forget everything; the odometry has started again if there is no smoother."""
         self.T_G_M = None
         self.covariance = np.full((6, 6), np.inf)
 
     def pose(self, smoother: FixedLagSmoother) -> MapPose | None:
-        """See `MapEstimator`."""
+        """Return where the newest frame is, with its covariance given T_M_I; None while it is not known."""
         if self.T_G_M is None:
             return None
         T_M_I = smoother.states.T_M_I[-1]
@@ -121,7 +54,31 @@ class _LooseEstimator:
         return MapPose(self.T_G_M, se3.compose(self.T_G_M, T_M_I), covariance)
 
 
-class SlidingWindowEstimator(_LooseEstimator):
+class TightEstimator(MapEstimator):
+    """VIL: the smoother has T_G_M among its states."""
+
+    def start(self, T_G_M: F64, smoother: FixedLagSmoother) -> None:
+        """See `MapEstimator`."""
+        localized = _localized(smoother)
+        localized.start_base_frame(T_G_M)
+        self.associated = localized.map_tracks
+
+    def add(self, answer: Answer, matches: MapMatches, smoother: FixedLagSmoother) -> None:  # noqa: ARG002
+        """See `MapEstimator`."""
+        _localized(smoother).associate(matches)
+
+    def stop(self, smoother: FixedLagSmoother | None) -> None:
+        """See `MapEstimator`."""
+        self.associated = None
+        if smoother is not None:
+            _localized(smoother).stop_base_frame()
+
+    def pose(self, smoother: FixedLagSmoother) -> MapPose | None:
+        """Return the joint estimate."""
+        return _localized(smoother).map_pose
+
+
+class SlidingWindowEstimator(MapEstimator):
     """SWL: T_G_M over the window's matches, all poses fixed, whenever there is an answer."""
 
     def __init__(self, device: RecordedSensors, rule: MapRule, options: WindowOptions) -> None:
@@ -129,12 +86,7 @@ class SlidingWindowEstimator(_LooseEstimator):
         super().__init__()
         self._cameras, self._T_I_C = device.cameras, device.T_I_C
         self._rule, self._options = rule, options
-        self._tracks = MapTracks(estimates_landmarks=False)
-
-    @property
-    def associated(self) -> MapTracks | None:
-        """See `MapEstimator`."""
-        return self._tracks
+        self._tracks = self.associated = MapTracks(estimates_landmarks=False)
 
     def start(self, T_G_M: F64, smoother: FixedLagSmoother) -> None:
         """See `MapEstimator`."""
@@ -180,10 +132,10 @@ class SlidingWindowEstimator(_LooseEstimator):
     def stop(self, smoother: FixedLagSmoother | None) -> None:
         """See `MapEstimator`."""
         super().stop(smoother)
-        self._tracks = MapTracks(estimates_landmarks=False)
+        self._tracks = self.associated = MapTracks(estimates_landmarks=False)
 
 
-class PoseEstimator(_LooseEstimator):
+class PoseEstimator(MapEstimator):
     """ROVIOLI's loose coupling: T_G_M from the poses of single images with their covariances."""
 
     def __init__(self) -> None:
@@ -223,16 +175,13 @@ class PoseEstimator(_LooseEstimator):
         self._poses = {}
 
 
-class OdometryEstimator(_LooseEstimator):
+class OdometryEstimator(MapEstimator):
     """ODO: aligned once, at the first matches; drift stays."""
 
     def start(self, T_G_M: F64, smoother: FixedLagSmoother) -> None:
         """See `MapEstimator`."""
         if self.T_G_M is None:
             super().start(T_G_M, smoother)
-
-    def add(self, answer: Answer, matches: MapMatches, smoother: FixedLagSmoother) -> None:
-        """See `MapEstimator`: later answers do not matter."""
 
 
 def make_estimator(
@@ -241,11 +190,9 @@ def make_estimator(
     """Return the estimator of a mode: vil, swl, pose or odo."""
     if mode == "swl":
         return SlidingWindowEstimator(device, rule, options)
-    makers: dict[str, type[TightEstimator] | type[PoseEstimator] | type[OdometryEstimator]] = {
-        "vil": TightEstimator,
-        "pose": PoseEstimator,
-        "odo": OdometryEstimator,
-    }
+    makers: dict[str, type[MapEstimator]] = {
+        "vil": TightEstimator, "pose": PoseEstimator, "odo": OdometryEstimator
+    }  # fmt: skip
     return makers[mode]()
 
 

@@ -4,25 +4,28 @@ import collections
 import dataclasses
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
-from enum import Enum
 
 import numpy as np
 
 from maplab_py.algorithms.localization.localizer import Outcome
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import EstimationError, UserError
+from maplab_py.estimation.window.localized import MapPose
 from maplab_py.estimation.window.map_tracks import MapMatches
 from maplab_py.estimation.window.options import WindowOptions
 from maplab_py.estimation.window.smoother import FixedLagSmoother
 from maplab_py.frontend.localization import agreement, map_source, track_check
-from maplab_py.frontend.localization.estimators import MapEstimator, MapPose, make_estimator
+from maplab_py.frontend.localization.estimators import MapEstimator, make_estimator
 from maplab_py.frontend.localization.keypoints import FrameKeypoints, frame_keypoints
 from maplab_py.frontend.localization.matcher import Answer, MapMatcher
 from maplab_py.frontend.localization.options import OnlineLocalizationOptions
+from maplab_py.frontend.odometry_options import OdometryOptions
 from maplab_py.frontend.odometry_update import OdometryUpdate
+from maplab_py.frontend.vertex_keypoints import check_descriptors_exist
 from maplab_py.geometry import se3
 from maplab_py.interop.recordings.protocol import RecordedSensors
-from maplab_py.vision.features.options import NETWORKS
+from maplab_py.vision.features.extractors import KINDS
+from maplab_py.vision.features.options import DESCRIPTORS, NETWORKS
 
 _EARLY = 0.95
 """A frame may be matched this share of the interval after the one before."""
@@ -31,13 +34,6 @@ _PROBABLY_RIGHT = 30
 (Tango), up to 14 by XFeat (rendered rooms)."""
 _HISTORY = 200
 """Frames back to which a late answer is used."""
-
-
-class LocalizationState(Enum):
-    """Whether the odometry knows where it is in the map."""
-
-    SEARCHING = "searching"
-    LOCALIZED = "localized"
 
 
 @dataclasses.dataclass(eq=False)
@@ -62,8 +58,7 @@ class LocalizedFrame:
     """Localisation of a frame."""
 
     time_ns: int
-    state: LocalizationState
-    pose: MapPose | None
+    pose: MapPose | None  # None while it is not known
     answer: Answer | None  # to this frame, or to the one before if a network has described it
     stage_ms: dict[str, float]  # elapsed time
 
@@ -147,7 +142,7 @@ class OnlineLocalization:
         self.counts.frames += 1
         self.events = []
         if update.state is None or smoother is None:
-            return LocalizedFrame(update.time_ns, LocalizationState.SEARCHING, None, None, {})
+            return LocalizedFrame(update.time_ns, None, None, {})
         if update.mission != self._mission:
             self._start_again(update.mission)
         pose = self.estimator.pose(smoother)
@@ -164,13 +159,11 @@ class OnlineLocalization:
                 answer = self._used(smoother, spent_ms)
         if answer is not None:
             pose = self.estimator.pose(smoother) or pose
-        state = LocalizationState.SEARCHING
         if pose is not None:
-            state = LocalizationState.LOCALIZED
             self.counts.localized_frames += 1
             if self.counts.first_localized_ns < 0:
                 self.counts.first_localized_ns = update.time_ns
-        return LocalizedFrame(update.time_ns, state, pose, answer, spent_ms)
+        return LocalizedFrame(update.time_ns, pose, answer, spent_ms)
 
     @property
     def p_G(self) -> F64:
@@ -350,6 +343,40 @@ class OnlineLocalization:
         self._filter.clear()
         self._poses.clear()
         self._waiting = None
+
+
+def opened_localization(
+    options: OnlineLocalizationOptions, device: RecordedSensors, odometry: OdometryOptions
+) -> OnlineLocalization | None:
+    """Read and index the map; None when the options name no map.
+
+    Raises:
+        UserError: There is no map, or it cannot be searched.
+        MapError: A file of it is damaged.
+    """
+    if options.map_folder is None:
+        return None
+    tracked = odometry.tracking.descriptor_type
+    searched = map_source.open_map(
+        options.map_folder,
+        with_covariances=options.rule.estimates_landmarks,
+        feature_type=KINDS[options.features or tracked].feature_type,
+        is_free=not options.features,
+    )
+    kind, features = searched.database.projection.kind, options.features or tracked
+    if not options.features:
+        features = next(
+            (
+                name
+                for name in (tracked, *DESCRIPTORS)
+                if KINDS[name].feature_type == kind.feature_type
+            ),
+            tracked,
+        )
+    else:
+        map_source.check_descriptors(searched, kind.size, KINDS[features].feature_type)
+    check_descriptors_exist(features)
+    return OnlineLocalization(searched, device, options, odometry.window, features)
 
 
 def _finite(covariance: F64) -> F64:

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from maplab_py.array_types import F64, I64
-from maplab_py.frontend.localization import online, reports
+from maplab_py.frontend import reports
+from maplab_py.frontend.localization import online
 from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.geometry import se3
 from maplab_py.interop.text_table import format_rows

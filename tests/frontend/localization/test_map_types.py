@@ -11,7 +11,7 @@ from maplab_py.algorithms.summary.options import SummaryMapOptions
 from maplab_py.algorithms.summary.summary import make_summary_map
 from maplab_py.errors import UserError
 from maplab_py.frontend.localization.map_source import check_descriptors, of_map, of_summary
-from maplab_py.frontend.localization.opening import opened_localization
+from maplab_py.frontend.localization.online import opened_localization
 from maplab_py.frontend.localization.options import OnlineLocalizationOptions
 from maplab_py.frontend.odometry_options import OdometryOptions
 from maplab_py.interop.recordings.map_replay import MapRecording
@@ -47,7 +47,7 @@ def test_images_get_the_descriptors_that_the_map_has(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "maplab_py.frontend.localization.opening.check_descriptors_exist", lambda name: None
+        "maplab_py.frontend.localization.online.check_descriptors_exist", lambda name: None
     )
     vi_map, _ = evaluate_unknown_quality(make_map([Walk(room=1, vertices=12)])[0])
     learned = with_numbers(vi_map, FeatureType.XFEAT)

@@ -8,7 +8,7 @@ import pytest
 from maplab_py.array_types import F64
 from maplab_py.errors import UserError
 from maplab_py.frontend.localization.map_source import of_summary
-from maplab_py.frontend.localization.online import LocalizationState, OnlineLocalization
+from maplab_py.frontend.localization.online import OnlineLocalization
 from maplab_py.frontend.localization.options import MODES, OnlineLocalizationOptions
 from maplab_py.frontend.odometry import Odometry
 from maplab_py.frontend.odometry_update import OdometryUpdate
@@ -38,7 +38,7 @@ def test_every_mode_knows_where_it_is(mode: str) -> None:
     assert localization.counts.starts == 1
     assert localization.counts.answers_by_tracking > 0
     assert localization.problem == ""
-    assert frames[-1].state is LocalizationState.LOCALIZED
+    assert frames[-1].pose is not None
 
 
 def test_uncertain_landmarks_are_estimated() -> None:
@@ -58,7 +58,7 @@ def test_the_next_frame_confirms_an_answer_with_many_matches() -> None:
         frame_s = 1e-9 * (frames[1].time_ns - frames[0].time_ns)
         assert (waited_s < 1.5 * frame_s) is is_certain
         assert waited_s < 0.7
-        localized = [f.time_ns for f in frames if f.state is LocalizationState.LOCALIZED]
+        localized = [f.time_ns for f in frames if f.pose is not None]
         assert localized[0] <= answers[2].time_ns
 
 
