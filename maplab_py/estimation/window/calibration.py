@@ -37,18 +37,11 @@ _UNITS = {
 }
 
 
-@dataclasses.dataclass(frozen=True)
-class CalibrationSigmas:
-    """Standard deviations of the numbers of a calibration before anything is seen."""
-
-    position_m: float = 0.02
-    rotation_rad: float = 0.06
-    delay_s: float = 0.01
-    readout_s: float = 0.015  # of all rows of an image
-    focal: float = 0.01  # as a share
-    centre_px: float = 5.0
-    distortion: float = 0.01
-    mirror: float = 0.01
+# Standard deviations of the numbers of a calibration before anything is seen.
+_POSITION_M, _ROTATION_RAD = 0.02, 0.06
+_DELAY_S, _READOUT_S = 0.01, 0.015
+"""Of the delay of images, and of the time from their first row to the last."""
+_FOCAL_SHARE, _CENTRE_PX, _DISTORTION, _MIRROR = 0.01, 5.0, 0.01, 0.01
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -69,20 +62,15 @@ class WindowCalibration:
 
     @classmethod
     def of(
-        cls,
-        cameras: tuple[Camera, ...],
-        T_I_C: F64,
-        kinds: tuple[str, ...] = (),
-        sigmas: CalibrationSigmas | None = None,
+        cls, cameras: tuple[Camera, ...], T_I_C: F64, kinds: tuple[str, ...] = ()
     ) -> WindowCalibration:
         """Return the calibration of cameras with poses (C, 7), of which some kinds are estimated."""
-        sigmas = sigmas or CalibrationSigmas()
         table = Cameras.of(cameras, T_I_C)
         width = CAMERA_INTRINSICS_COLUMN + table.parameters.shape[1] - 1
         columns = np.full((len(cameras), width), -1, dtype=np.int64)
         sigma: list[float] = []
         for row, camera in enumerate(cameras):
-            of_row = _sigmas_of(camera, sigmas, kinds, is_first=row == 0)
+            of_row = _sigmas_of(camera, kinds, is_first=row == 0)
             places = np.array(list(of_row), dtype=np.int64)
             columns[row, places] = len(sigma) + np.arange(len(places))
             sigma += of_row.values()
@@ -242,24 +230,22 @@ def _unit_of(name: str) -> tuple[float, str]:
     return 1.0, ""
 
 
-def _sigmas_of(
-    camera: Camera, sigmas: CalibrationSigmas, kinds: tuple[str, ...], *, is_first: bool
-) -> dict[int, float]:
+def _sigmas_of(camera: Camera, kinds: tuple[str, ...], *, is_first: bool) -> dict[int, float]:
     """Return the standard deviation of each number of a camera that is estimated, by its column."""
     result: dict[int, float] = {}
     if "extrinsics" in kinds:
-        result |= dict.fromkeys(range(3), sigmas.position_m)
-        result |= dict.fromkeys(range(3, 6), sigmas.rotation_rad)
+        result |= dict.fromkeys(range(3), _POSITION_M)
+        result |= dict.fromkeys(range(3, 6), _ROTATION_RAD)
     if "time_offset" in kinds and is_first:
-        result[CAMERA_DELAY_COLUMN] = sigmas.delay_s
+        result[CAMERA_DELAY_COLUMN] = _DELAY_S
     if "line_delay" in kinds and is_first:
-        result[CAMERA_DELAY_COLUMN + 1] = sigmas.readout_s / camera.height_px
+        result[CAMERA_DELAY_COLUMN + 1] = _READOUT_S / camera.height_px
     if "intrinsics" in kinds:
         mirrors = len(camera.intrinsics) - 4
-        of_all = [sigmas.mirror] * mirrors
-        of_all += (sigmas.focal * np.abs(camera.intrinsics[-4:-2])).tolist()
-        of_all += [sigmas.centre_px] * 2
-        of_all += [sigmas.distortion] * len(camera.distortion_parameters)
+        of_all = [_MIRROR] * mirrors
+        of_all += (_FOCAL_SHARE * np.abs(camera.intrinsics[-4:-2])).tolist()
+        of_all += [_CENTRE_PX] * 2
+        of_all += [_DISTORTION] * len(camera.distortion_parameters)
         first = CAMERA_INTRINSICS_COLUMN
         result |= {first + k: sigma for k, sigma in enumerate(of_all)}
     return result

@@ -11,7 +11,8 @@ import numpy as np
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.estimation.kernels import window as kernels
 from maplab_py.estimation.kernels.window_arguments import FRAME_SIZE, DenseSystem
-from maplab_py.estimation.window import inertial, options
+from maplab_py.estimation.window import inertial
+from maplab_py.estimation.window.options import WindowOptions
 from maplab_py.estimation.window.states import WindowStates
 from maplab_py.geometry import se3
 
@@ -114,10 +115,10 @@ class Standstill:
     zero against gravity and bias, and no turn that the mean angular velocity is the bias.
     """
 
-    def __init__(self, kernel: ModuleType, sigmas: options.StandstillSigmas) -> None:
-        """Take the kernel of the residual `relative_pose`."""
-        self._kernel, self._sigmas = kernel, sigmas
-        weights = np.repeat([1.0 / sigmas.position_m, 1.0 / sigmas.rotation_rad], 3)
+    def __init__(self, kernel: ModuleType, options: WindowOptions) -> None:
+        """Take the kernel of the residual `relative_pose`, and the deviations of a body at rest."""
+        self._kernel, self._options = kernel, options
+        weights = np.repeat([1.0 / options.rest_sigma_m, 1.0 / options.rest_sigma_rad], 3)
         self._pose_weight = np.diag(weights)
 
     def poses(self, edges: I64, T_M_I: F64) -> Factors:
@@ -132,7 +133,7 @@ class Standstill:
 
     def velocities(self, frames: I64, is_turning: Mask, motion: F64) -> Factors:
         """Return the factors of frames (N,) without velocity; those that only turn are less sure."""
-        sigmas = self._sigmas
-        sigma = np.where(is_turning, sigmas.turning_velocity_mps, sigmas.velocity_mps)
+        options = self._options
+        sigma = np.where(is_turning, options.turning_sigma_mps, options.rest_sigma_mps)
         jacobian = np.eye(3) / sigma[:, None, None]
         return motion[frames, :3] / sigma[:, None], jacobian, FRAME_SIZE * frames + _VELOCITY

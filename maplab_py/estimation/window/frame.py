@@ -98,12 +98,7 @@ class WindowUpdate:
     state: NavState  # newest frame
     covariance: F64  # (15, 15) order [p, theta, v, b_g, b_a]; infinite where nothing is known
     is_keyframe: bool
-    num_frames: int
     num_landmarks: int  # that were estimated
-    num_observations: int  # of them
     median_error_px: float  # of all observations of landmarks; nan without any
-    costs: dict[str, float]
-    iterations: int
-    termination: str
     released: NavState  # final estimates of frames that have left the window, in the order of time
     stage_ms: dict[str, float]  # processor time of this thread

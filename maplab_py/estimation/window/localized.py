@@ -11,7 +11,6 @@ import numpy as np
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.kernels.window_arguments import FRAME_SIZE
-from maplab_py.estimation.linear.protocol import NotPositiveDefinite
 from maplab_py.estimation.window import map_tracks, smoother
 from maplab_py.estimation.window.calibration import WindowCalibration
 from maplab_py.estimation.window.map_terms import MAP_GATE_CHI2, MapTerms, contradicted_unless_most
@@ -165,11 +164,11 @@ class LocalizedSmoother(smoother.FixedLagSmoother):
     def _covariance(self, problem: WindowProblem) -> F64:
         if not self.is_localized:
             return super()._covariance(problem)
-        newest = len(self._states) - 1
-        try:
-            joint = problem.covariance_with_base(problem.undamped_near(self._states), newest)
-        except NotPositiveDefinite:
-            joint = np.full((FRAME_SIZE + 6, FRAME_SIZE + 6), np.inf)
+        frames, others = FRAME_SIZE * len(self._states), len(self.calibration)
+        newest = np.arange(frames - FRAME_SIZE, frames)
+        joint = problem.covariance(
+            self._states, np.concatenate([newest, frames + others + np.arange(6)])
+        )
         self._pose = self._map_pose(joint)
         return joint[:FRAME_SIZE, :FRAME_SIZE]
 

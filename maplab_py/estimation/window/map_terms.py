@@ -52,10 +52,7 @@ class MapResiduals:
     """Whitened residuals with exact Jacobians; zero where the camera cannot see the landmark."""
 
     residual: F64  # (O, 2)
-    jacobian: F64  # (O, 2, 15), whose parts follow
-    of_frame: F64  # (O, 2, 6) by [p, theta] of T_M_I
-    of_base: F64  # (O, 2, 6) by [p, theta] of T_G_M
-    of_landmark: F64  # (O, 2, 3) by p_G
+    jacobian: F64  # (O, 2, 15) by [p, theta] of T_M_I, then of T_G_M, and by p_G
     is_visible: Mask  # (O,)
 
 
@@ -122,8 +119,7 @@ class MapTerms:
         window_kernels().reproject_map(
             self._data, self._cameras, T_M_I, T_G_M[None], p_G, residual, jacobian, visible
         )
-        of_frame, of_base, of_landmark = jacobian[..., :6], jacobian[..., 6:12], jacobian[..., 12:]
-        return MapResiduals(residual, jacobian, of_frame, of_base, of_landmark, visible)
+        return MapResiduals(residual, jacobian, visible)
 
     def errors_px(self, states: WindowStates) -> F64:
         """Return the reprojection error (O,) of every observation; infinite where it is not visible."""
@@ -173,7 +169,7 @@ class MapTerms:
         """Return the normal equations (6, 6), (6,) of T_G_M while all else is fixed, and the costs."""
         now = self._evaluated(states)
         rho, root = self._weighed(now)
-        J = (now.of_base * root[:, None, None]).reshape(-1, 6)
+        J = (now.jacobian[..., 6:12] * root[:, None, None]).reshape(-1, 6)
         square, gradient = J.T @ J, J.T @ (now.residual * root[:, None]).reshape(-1)
         tilt, of_tilt = self._tilt(states.T_G_M[0])
         square[3:, 3:] += of_tilt.T @ of_tilt
@@ -235,7 +231,7 @@ class MapTerms:
     ) -> MapElimination:
         """Return the normal equations of the landmarks, at least one."""
         J, r = at.jacobian[..., :12] * root[:, None, None], residual * root[:, None]
-        Q = at.of_landmark * root[:, None, None]
+        Q = at.jacobian[..., 12:] * root[:, None, None]
         seen, frames = self.observations, len(states)
         assert seen.information_G is not None
         first, turned = seen.start[:-1], Q.transpose(0, 2, 1)

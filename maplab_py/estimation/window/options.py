@@ -14,16 +14,6 @@ _OUTLIER_MEDIANS, _LEAST_GATE_SIGMAS = 8.0, 0.5
 """Errors beyond so many medians are outliers within the gate, too, if they exceed so many deviations."""
 
 
-@dataclasses.dataclass(frozen=True)
-class StandstillSigmas:
-    """Largest motion of a body at rest."""
-
-    position_m: float  # over an edge
-    rotation_rad: float
-    velocity_mps: float
-    turning_velocity_mps: float  # of a body that only turns
-
-
 class WindowOptions(Options, prefix="vio_"):
     """Size of the window, choice of keyframes and landmarks, and when an update is good enough."""
 
@@ -106,13 +96,6 @@ class WindowOptions(Options, prefix="vio_"):
     def follows_thesis(self) -> bool:
         """Whether landmarks enter and leave as in the thesis."""
         return self.landmark_policy == "thesis"
-
-    @property
-    def standstill(self) -> StandstillSigmas:
-        """Largest motion of a body at rest."""
-        return StandstillSigmas(
-            self.rest_sigma_m, self.rest_sigma_rad, self.rest_sigma_mps, self.turning_sigma_mps
-        )
 
 
 @dataclasses.dataclass(frozen=True)

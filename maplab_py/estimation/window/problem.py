@@ -123,17 +123,6 @@ class WindowProblem:
         self._kernels.evaluate(self._data, self._point(states), result)
         return result[:, 0], result[:, 1]
 
-    def covariance_with_base(self, linear: WindowLinearization, frame: int) -> F64:
-        """Return the joint covariance (21, 21) of a frame, as `covariance`, and of the base frame.
-
-        Raises:
-            NotPositiveDefinite: The measurements do not determine them.
-        """
-        size = len(linear.system.matrix)
-        of_frame = window_arguments.FRAME_SIZE * frame + np.arange(window_arguments.FRAME_SIZE)
-        rows = np.concatenate([of_frame, np.arange(size - 6, size)])
-        return self._covariance(linear, rows)
-
     def undamped_near(self, states: WindowStates) -> WindowLinearization:
         """Return equations for covariances at converged states.
 
@@ -144,46 +133,35 @@ class WindowProblem:
             return self._latest
         return self.linearize(states, _LANDMARK_DAMPING)
 
-    def covariance_of_frames(self, linear: WindowLinearization) -> F64:
-        """Return the joint covariance (n, n), which begins with all frames, each [p, theta, v, b_g, b_a].
+    def covariance_of_all(self, states: WindowStates) -> F64:
+        """Return the joint covariance (n, n) of the whole system at converged states; see `covariance`.
 
         Raises:
             NotPositiveDefinite: The measurements do not determine the frames.
         """
-        lower, _ = scipy.linalg.lapack.dpotri(_factorised(linear.system.matrix.copy()), lower=0)
+        matrix = self.undamped_near(states).system.matrix.copy()
+        lower, _ = scipy.linalg.lapack.dpotri(_factorised(matrix), lower=0)
         upper = np.triu(lower)
         return np.asarray(upper + np.triu(upper, 1).T)
 
-    def covariance(self, linear: WindowLinearization, frame: int) -> F64:
-        """Return the covariance (15, 15) of a frame, order [p, theta, v, b_g, b_a].
+    def covariance(self, states: WindowStates, rows: I64) -> F64:
+        """Return the joint covariance (n, n) of rows (n,) of the system; infinite = not determined.
 
-        Raises:
-            NotPositiveDefinite: The measurements do not determine the frames.
+        Frames come first, each [p, theta, v, b_g, b_a], then the calibration, and the base frame.
         """
-        return self._covariance(
-            linear, window_arguments.FRAME_SIZE * frame + np.arange(window_arguments.FRAME_SIZE)
-        )
-
-    def covariance_of_calibration(self, linear: WindowLinearization) -> F64:
-        """Return the covariance (K, K) of the calibration.
-
-        Raises:
-            NotPositiveDefinite: The measurements do not determine the states.
-        """
-        first = window_arguments.FRAME_SIZE * linear.kept.Y.shape[1]
-        return self._covariance(linear, first + np.arange(len(self._calibration)))
-
-    def newest_covariance(self, states: WindowStates) -> F64:
-        """Return the covariance (15, 15) of the newest frame; infinite = unknown."""
         try:
-            return self.covariance(self.undamped_near(states), len(states) - 1)
+            matrix = self.undamped_near(states).system.matrix.copy()
+            columns = np.zeros((len(matrix), len(rows)))
+            columns[rows, np.arange(len(rows))] = 1.0
+            block = self._solved(_factorised(matrix), columns)[rows]
         except NotPositiveDefinite:
-            return np.full((window_arguments.FRAME_SIZE, window_arguments.FRAME_SIZE), np.inf)
+            return np.full((len(rows), len(rows)), np.inf)
+        return np.asarray(0.5 * (block + block.T))
 
     def scale_sigma(self, states: WindowStates) -> float:
         """Return the standard deviation of the scale of the positions, as a share; infinite = unknown."""
         try:
-            covariance = self.covariance_of_frames(self.undamped_near(states))
+            covariance = self.covariance_of_all(states)
         except NotPositiveDefinite:
             return float("inf")
         size = window_arguments.FRAME_SIZE * len(states)
@@ -191,18 +169,8 @@ class WindowProblem:
 
     def calibration_sigma(self, states: WindowStates) -> F64:
         """Return the standard deviations (K,) of the calibration; infinite = unknown."""
-        try:
-            covariance = self.covariance_of_calibration(self.undamped_near(states))
-        except NotPositiveDefinite:
-            return np.full(len(self._calibration), np.inf)
-        return np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
-
-    def _covariance(self, linear: WindowLinearization, rows: I64) -> F64:
-        matrix = linear.system.matrix.copy()
-        columns = np.zeros((len(matrix), len(rows)))
-        columns[rows, np.arange(len(rows))] = 1.0
-        block = self._solved(_factorised(matrix), columns)[rows]
-        return np.asarray(0.5 * (block + block.T))
+        rows = window_arguments.FRAME_SIZE * len(states) + np.arange(len(self._calibration))
+        return np.sqrt(np.maximum(np.diagonal(self.covariance(states, rows)), 0.0))
 
     def _linearize(self, states: WindowStates, damping: float, part: Part) -> WindowLinearization:
         frames, landmarks = len(states), len(states.h)

@@ -15,7 +15,7 @@ import numpy as np
 from maplab_py.array_types import F64, I32, I64, Mask
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.codegen.kernels import residual_kernel, window_kernels
-from maplab_py.estimation.kernels.window_arguments import WindowPoint
+from maplab_py.estimation.kernels.window_arguments import FRAME_SIZE, WindowPoint
 from maplab_py.estimation.linear.threads import single_thread
 from maplab_py.estimation.problem.solver import SolverOptions, optimize_states
 from maplab_py.estimation.symbolic import sources
@@ -82,7 +82,7 @@ class FixedLagSmoother:
         self._back_projection = BackProjection(self._kernels, self.calibration)
         self._chain = inertial.InertialChain(residual_kernel("inertial", sources.inertial), imu)
         still = residual_kernel("relative_pose", sources.relative_pose)
-        self._standstill = Standstill(still, options.standstill)
+        self._standstill = Standstill(still, options)
         self._triangulator = triangulation.Triangulator(self._kernels, options)
         self.tracks = Tracks()
         self._inverse_depth = 0.0  # median of landmarks [1/m], 0 = not known yet
@@ -130,7 +130,7 @@ class FixedLagSmoother:
             with self._stage("optimise"):
                 map_terms = self._map_terms()  # it takes tracks from the odometry's landmarks
                 problem, rows, order = self._problem(self.tracks.landmark_rows, map_terms)
-                self._states, summary = optimize_states(problem, self._states, self._solver, SILENT)
+                self._states, _ = optimize_states(problem, self._states, self._solver, SILENT)
                 self.tracks.h[rows] = self._states.h
                 self._take_calibration()
                 self._take_map_states()
@@ -146,13 +146,8 @@ class FixedLagSmoother:
             state=newest,
             covariance=self.newest_covariance,
             is_keyframe=is_keyframe,
-            num_frames=len(self._states),
             num_landmarks=len(rows),
-            num_observations=len(order),
             median_error_px=error_px,
-            costs=summary.final_costs,
-            iterations=summary.iterations,
-            termination=summary.termination,
             released=NavState.stack(self._released),
             stage_ms=self._stage_ms,
         )
@@ -361,7 +356,8 @@ class FixedLagSmoother:
             self._back_projection.parameters = self.cameras.parameters
 
     def _covariance(self, problem: WindowProblem) -> F64:
-        return problem.newest_covariance(self._states)
+        newest = FRAME_SIZE * (len(self._states) - 1) + np.arange(FRAME_SIZE)
+        return problem.covariance(self._states, newest)
 
     def _remove_outliers(self, problem: WindowProblem, order: I64) -> float:
         """Remove observations with errors beyond the gate; return the median error [px]."""

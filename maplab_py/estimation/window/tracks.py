@@ -265,20 +265,10 @@ class Tracks:
             self.observations = dataclasses.replace(
                 self.observations, row=place[self.observations.row]
             )
-        count = len(ids)
-        added = {
-            "id": ids,
-            "is_landmark": np.zeros(count, dtype=np.bool_),
-            "is_closed": np.zeros(count, dtype=np.bool_),
-            "is_persistent": np.zeros(count, dtype=np.bool_),
-            "anchor_frame": np.zeros(count, dtype=np.int32),
-            "anchor_camera": np.zeros(count, dtype=np.int32),
-            "h": np.zeros((count, 3)),
-            "expected": np.zeros((count, 2)),
-            "last_seen": np.zeros(count, dtype=np.int64),
-        }
-        for name, values in added.items():
-            setattr(self, name, np.concatenate([getattr(self, name), values])[order])
+        for name in _COLUMNS:
+            column = getattr(self, name)
+            added = np.zeros((len(ids), *column.shape[1:]), column.dtype) if name != "id" else ids
+            setattr(self, name, np.concatenate([column, added])[order])
 
     def _forget(self) -> None:
         """Remove tracks without observations, closed ones when they have ended."""

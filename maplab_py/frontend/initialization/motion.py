@@ -66,7 +66,7 @@ class MotionStart:
         )
         self._rays = RayMaker(cameras, T_I_C)
         self._accel_bias_sigma = accel_bias_sigma(imu, options)
-        biases = refinement.BiasSigmas(options.gyro_bias_sigma_radps, self._accel_bias_sigma)
+        biases = options.gyro_bias_sigma_radps, self._accel_bias_sigma
         self._refinement = refinement.Refinement(cameras, T_I_C, self.imu, biases, imu)
 
     def solve(self, segment: Segment, limits: Limits | None = None) -> Attempt:

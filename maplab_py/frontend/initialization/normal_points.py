@@ -15,6 +15,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, I32, I64, Mask
 from maplab_py.estimation.imu.preintegration import propagate
+from maplab_py.estimation.window.calibration import WindowCalibration
 from maplab_py.estimation.window.cameras import CameraPoses
 from maplab_py.estimation.window.states import WindowStates
 from maplab_py.frontend.initialization.segment import ObservedFrames, Segment
@@ -22,31 +23,21 @@ from maplab_py.geometry import se3
 from maplab_py.sensors import Camera, Imu, projection
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Rig:
-    """Cameras and their poses T_I_C (C, 7)."""
-
-    cameras: tuple[Camera, ...]
-    T_I_C: F64
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Landmarks:
-    """Places of L tracks."""
-
-    track_id: I64  # (L,) ascending
-    p_M: F64  # (L, 3)
-
-
 def with_normal_points(
-    segment: Segment, states: WindowStates, landmarks: Landmarks, rig: Rig, gate_chi2: float
+    segment: Segment,
+    states: WindowStates,
+    track_id: I64,
+    p_M: F64,
+    rig: WindowCalibration,
+    gate_chi2: float,
 ) -> Segment:
     """Return a segment whose observations of landmarks are averaged with those of the frames between.
 
     Args:
         segment: Frames.
         states: Their approximate states (F).
-        landmarks: Approximate landmarks. Observations of other tracks stay as they are.
+        track_id: Tracks (L,) that are landmarks, ascending; observations of others stay as they are.
+        p_M: Their approximate places (L, 3).
         rig: The cameras.
         gate_chi2: Largest squared difference of two observations of a mean in standard deviations.
 
@@ -54,16 +45,16 @@ def with_normal_points(
         The segment with the weighted means and their standard deviations, and no frames between.
     """
     between = segment.between
-    if not len(between.frame) or not len(landmarks.track_id):
+    if not len(between.frame) or not len(track_id):
         return segment
     edge = np.searchsorted(segment.time_ns, between.time_ns, side="right") - 1
     T_M_I, share = _poses_between(segment, states, edge)
     nearest = (edge + (share > 0.5)).astype(np.int32)[between.frame]
-    names = _names(segment, segment.frame, landmarks, len(rig.cameras))
-    target, has_target = _places(names, _names(between, nearest, landmarks, len(rig.cameras)))
+    names = _names(segment, segment.frame, track_id, len(rig.cameras))
+    target, has_target = _places(names, _names(between, nearest, track_id, len(rig.cameras)))
     rows = np.flatnonzero(has_target)
     target, camera, near = target[rows], between.camera[rows], nearest[rows]
-    p_M = landmarks.p_M[np.searchsorted(landmarks.track_id, between.track_id[rows])]
+    p_M = p_M[np.searchsorted(track_id, between.track_id[rows])]
     there = CameraPoses.of(T_M_I, rig.T_I_C).to_camera(between.frame[rows], camera, p_M)
     here = CameraPoses.of(states.T_M_I, rig.T_I_C).to_camera(near, camera, p_M)
     shift, is_visible = _differences(rig.cameras, camera, there, here)
@@ -102,12 +93,11 @@ def _poses_between(segment: Segment, states: WindowStates, edge: I64) -> tuple[F
     return se3.retract(T_M_I[sample], share[:, None] * missing[edge]), share
 
 
-def _names(seen: ObservedFrames, frame: I32, landmarks: Landmarks, cameras: int) -> I64:
+def _names(seen: ObservedFrames, frame: I32, track_id: I64, cameras: int) -> I64:
     """Return a number (N,) for each frame (N,), camera and landmark; -1 where a track is none."""
-    count = len(landmarks.track_id)
-    row = np.minimum(np.searchsorted(landmarks.track_id, seen.track_id), count - 1)
-    name = (frame.astype(np.int64) * cameras + seen.camera) * count + row
-    return np.where(landmarks.track_id[row] == seen.track_id, name, -1)
+    row = np.minimum(np.searchsorted(track_id, seen.track_id), len(track_id) - 1)
+    name = (frame.astype(np.int64) * cameras + seen.camera) * len(track_id) + row
+    return np.where(track_id[row] == seen.track_id, name, -1)
 
 
 def _places(names: I64, wanted: I64) -> tuple[I64, Mask]:

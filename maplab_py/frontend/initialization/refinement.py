@@ -44,14 +44,6 @@ _NORMAL_POINTS_UNITS = 5.0
 """Units of work of an iteration for each frame, and of other parts."""
 
 
-@dataclasses.dataclass(frozen=True)
-class BiasSigmas:
-    """Standard deviations of the biases' components before anything is measured."""
-
-    gyro_radps: float
-    accel_mps2: float
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Refined:
     """States of F frames, and the uncertainty of the last and of the scale."""
@@ -59,12 +51,10 @@ class Refined:
     time_ns: I64  # (F,)
     states: WindowStates
     covariance: F64  # (15, 15) of the last frame, order [p, theta, v, b_g, b_a]
-    travelled_m: float  # largest distance from the first position
-    travelled_sigma_m: float
+    travelled_sigma_m: float  # of the largest distance from the first position
     scale_sigma: float  # standard deviation of the scale of all positions, as a share of it
     median_error_px: float
     num_landmarks: int
-    num_rejected: int  # tracks with parallax that fit no point
     imu: Imu  # with the noise that was assumed or estimated
 
     @property
@@ -96,7 +86,6 @@ class _Solved:
     states: WindowStates
     imu: Imu
     tracks: Tracks  # whose landmarks are those of the states
-    rejected: int
     has_converged: bool
 
 
@@ -108,7 +97,7 @@ class Refinement:
         cameras: tuple[Camera, ...],
         T_I_C: F64,
         imu: Imu,
-        biases: BiasSigmas,
+        bias_sigmas: tuple[float, float],
         data_sheet: Imu,
     ) -> None:
         """Prepare kernels for the cameras, with poses T_I_C (C, 7), and the IMU.
@@ -116,20 +105,17 @@ class Refinement:
         Args:
             T_I_C: Their poses.
             imu: With the noise that is assumed.
-            biases: What is known of them.
+            bias_sigmas: Deviations of a component of the gyroscope's and the accelerometer's bias.
             data_sheet: The IMU with the least noise that it can have.
         """
-        self._rig = normal_points.Rig(cameras, T_I_C)
         self._calibration = calibration.WindowCalibration.of(cameras, T_I_C)
         self._kernels = window_kernels()
         self._back_projection = BackProjection(self._kernels, self._calibration)
         self._inertial = residual_kernel("inertial", sources.inertial)
         options = WindowOptions(max_landmarks=_MAX_LANDMARKS, gate_chi2=_GATE_CHI2)
-        self._standstill = Standstill(
-            residual_kernel("relative_pose", sources.relative_pose), options.standstill
-        )
-        self._options = options
-        self._imu, self._biases, self._data_sheet = imu, biases, data_sheet
+        still = residual_kernel("relative_pose", sources.relative_pose)
+        self._standstill, self._options = Standstill(still, options), options
+        self._imu, self._bias_sigmas, self._data_sheet = imu, bias_sigmas, data_sheet
 
     def refine(
         self, segment: Segment, states: WindowStates, *, wanted_scale_sigma: float = 0.0
@@ -158,8 +144,9 @@ class Refinement:
             return refined
         assert solved is not None
         segment = normal_points.with_normal_points(
-            segment, solved.states, self._landmarks(solved), self._rig, self._options.gate_chi2
-        )
+            segment, solved.states, *self._landmarks(solved), self._calibration,
+            self._options.gate_chi2,
+        )  # fmt: skip
         yield _NORMAL_POINTS_UNITS
         imu, observed = self._with_estimated_noise(solved), self._observations(segment)
         yield _COVARIANCE_UNITS
@@ -167,18 +154,17 @@ class Refinement:
         again = yield from self._solved(round_, solved.states)
         return self._judged(segment, again)
 
-    def _landmarks(self, solved: _Solved) -> normal_points.Landmarks:
-        """Return the landmarks of a round that are not at infinity."""
+    def _landmarks(self, solved: _Solved) -> tuple[I64, F64]:
+        """Return ids (L,) and places (L, 3) of the landmarks of a round that are not at infinity."""
         tracks = solved.tracks
         rows = tracks.landmark_rows[tracks.h[tracks.landmark_rows, 2] > _LEAST_INVERSE_DEPTH]
-        poses = CameraPoses.of(solved.states.T_M_I, self._rig.T_I_C)
-        return normal_points.Landmarks(tracks.id[rows], tracks.points(rows, poses))
+        poses = CameraPoses.of(solved.states.T_M_I, self._calibration.T_I_C)
+        return tracks.id[rows], tracks.points(rows, poses)
 
     def _with_estimated_noise(self, solved: _Solved) -> Imu:
         """Return the IMU with the noise that the residuals show; as assumed when they cannot tell."""
         try:
-            linear = solved.problem.undamped_near(solved.states)
-            covariance = solved.problem.covariance_of_frames(linear)
+            covariance = solved.problem.covariance_of_all(solved.states)
         except NotPositiveDefinite:
             return self._imu
         factor = imu_noise.noise_factor(solved.chain, solved.states, covariance)
@@ -191,7 +177,7 @@ class Refinement:
     def _solved(self, round_: _Round, states: WindowStates) -> paced_work.Work[_Solved | None]:
         """Triangulate landmarks from states and solve; the result is None without landmarks."""
         segment = round_.segment
-        tracks, candidates = self._tracks(segment, round_.observed, states, round_.gate_chi2)
+        tracks = self._tracks(segment, round_.observed, states, round_.gate_chi2)
         rows = tracks.landmark_rows
         if not len(rows):
             return None
@@ -212,8 +198,7 @@ class Refinement:
         states, summary = yield from paced_work.each_step(steps, _UNITS_PER_FRAME * len(segment))
         has_converged = summary.iterations < round_.iterations and len(order) > 0
         tracks.h[rows] = states.h
-        rejected = candidates - len(rows)
-        return _Solved(problem, chain, states, round_.imu, tracks, rejected, has_converged)
+        return _Solved(problem, chain, states, round_.imu, tracks, has_converged)
 
     @staticmethod
     def _judged(segment: Segment, solved: _Solved | None) -> Refined | None:
@@ -228,26 +213,22 @@ class Refinement:
             return None
         far = int(np.argmax(np.linalg.norm(states.T_M_I[:, 4:] - states.T_M_I[0, 4:], axis=1)))
         try:
-            linear = problem.undamped_near(states)
-            of_frames = problem.covariance_of_frames(linear)
+            of_frames = problem.covariance_of_all(states)
         except NotPositiveDefinite:
             return None
         last, first_far = FRAME_SIZE * (len(states) - 1), FRAME_SIZE * far
         covariance = of_frames[last:, last:]
         covariance_far = of_frames[first_far : first_far + 3, first_far : first_far + 3]
         way = states.T_M_I[far, 4:] - states.T_M_I[0, 4:]
-        length = float(np.linalg.norm(way))
-        ahead = way / max(length, 1e-9)
+        ahead = way / max(float(np.linalg.norm(way)), 1e-9)
         return Refined(
             time_ns=segment.time_ns,
             states=states,
             covariance=covariance,
-            travelled_m=length,
             travelled_sigma_m=float(np.sqrt(max(float(ahead @ covariance_far @ ahead), 0.0))),
             scale_sigma=scale_sigma(states.T_M_I[:, 4:], of_frames),
             median_error_px=float(np.median(error_px)),
             num_landmarks=len(solved.states.h),
-            num_rejected=solved.rejected,
             imu=solved.imu,
         )
 
@@ -257,8 +238,8 @@ class Refinement:
         root[:3, :3] = np.eye(3) / _GAUGE_SIGMA
         # a small turn dtheta on the right is R dtheta in M
         root[3, 3:6] = so3.to_matrix(states.T_M_I[0, :4])[2] / _GAUGE_SIGMA
-        root[4:7, 9:12] = np.eye(3) / self._biases.gyro_radps
-        root[7:10, 12:15] = np.eye(3) / self._biases.accel_mps2
+        root[4:7, 9:12] = np.eye(3) / self._bias_sigmas[0]
+        root[7:10, 12:15] = np.eye(3) / self._bias_sigmas[1]
         motion = states.motion.copy()
         motion[:, 3:] = 0.0
         is_fixed = np.zeros(len(states), dtype=np.bool_)
@@ -280,8 +261,8 @@ class Refinement:
         observed: tuple[I64, Observations],
         states: WindowStates,
         gate_chi2: float,
-    ) -> tuple[Tracks, int]:
-        """Return tracks with landmarks triangulated, and how many could have become one."""
+    ) -> Tracks:
+        """Return tracks with landmarks triangulated."""
         rows, seen = observed
         tracks = Tracks()
         tracks.add_frames(range(len(segment)), seen.frame, segment.track_id[rows], seen)
@@ -294,7 +275,7 @@ class Refinement:
         triangulation.Triangulator(self._kernels, options).add_landmarks(
             tracks, candidates, at, only_stereo=False
         )
-        return tracks, min(len(candidates), options.max_landmarks)
+        return tracks
 
 
 def mission_frame(g_A: F64) -> F64:

@@ -112,7 +112,7 @@ def window_problem(
         chain.append(frame.imu_times_ns, frame.accel_gyro, motion, is_resting=False)
     still = residual_kernel("relative_pose", sources.relative_pose)
     never = np.zeros(len(window), dtype=np.bool_)
-    factors = FrameFactors(chain, Standstill(still, smoother.options.standstill), never, never)
+    factors = FrameFactors(chain, Standstill(still, smoother.options), never, never)
     prior = WindowPrior.of_state(start.T_M_I[0], start.motion[0], SIGMA)
     for T_M_I, motion in zip(window.T_M_I[1:], window.motion[1:], strict=True):
         prior = prior.with_frame(T_M_I, motion)

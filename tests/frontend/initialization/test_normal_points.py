@@ -5,14 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from maplab_py.array_types import F64
+from maplab_py.array_types import F64, I64
+from maplab_py.estimation.window.calibration import WindowCalibration
 from maplab_py.estimation.window.cameras import CameraPoses
 from maplab_py.estimation.window.states import WindowStates
-from maplab_py.frontend.initialization.normal_points import (
-    Landmarks,
-    Rig,
-    with_normal_points,
-)
+from maplab_py.frontend.initialization.normal_points import with_normal_points
 from maplab_py.frontend.initialization.segment import History, ObservedFrames, Segment
 from maplab_py.sensors.projection import project
 from maplab_py.simulation.scenario import ImuOptions
@@ -34,19 +31,19 @@ EXACT_IMU = ImuOptions(
 class Case:
     segment: Segment  # every third frame
     states: WindowStates  # true
-    landmarks: Landmarks  # true
-    rig: Rig
+    track_id: I64
+    p_M: F64  # true, of the tracks
+    rig: WindowCalibration
 
     def averaged(self, states: WindowStates | None = None) -> Segment:
         return with_normal_points(
-            self.segment, states or self.states, self.landmarks, self.rig, GATE_CHI2
+            self.segment, states or self.states, self.track_id, self.p_M, self.rig, GATE_CHI2
         )
 
     def errors(self, segment: Segment) -> F64:
         """Return the differences (N, 2) of a segment's keypoints to the projections."""
-        of_landmark = np.searchsorted(self.landmarks.track_id, segment.track_id)
         poses = CameraPoses.of(self.states.T_M_I, self.rig.T_I_C)
-        p_C = poses.to_camera(segment.frame, segment.camera, self.landmarks.p_M[of_landmark])
+        p_C = poses.to_camera(segment.frame, segment.camera, self.p_M[segment.track_id])
         uv_px = np.zeros_like(segment.uv_px)
         for number, camera in enumerate(self.rig.cameras):
             rows = segment.camera == number
@@ -76,8 +73,8 @@ def case(cameras: int = 1, noise_px: float = 0.0, seed: int = 1) -> Case:
     states = WindowStates(
         flight.truth.T_G_I[rows], np.concatenate(motion, axis=1), np.zeros((0, 3))
     )
-    landmarks = Landmarks(np.arange(len(points)), points)
-    return Case(segment, states, landmarks, Rig(device.cameras, device.T_I_C))
+    rig = WindowCalibration.of(device.cameras, device.T_I_C)
+    return Case(segment, states, np.arange(len(points)), points, rig)
 
 
 def _points(flight: Flight) -> F64:
@@ -127,8 +124,7 @@ def test_a_wrong_scale_and_velocity_move_keypoints_hardly() -> None:
     T_M_I, motion = states.T_M_I.copy(), states.motion.copy()
     T_M_I[:, 4:] *= wrong
     motion[:, :3] *= wrong
-    landmarks = Landmarks(exact.landmarks.track_id, wrong * exact.landmarks.p_M)
-    scaled = dataclasses.replace(exact, landmarks=landmarks)
+    scaled = dataclasses.replace(exact, p_M=wrong * exact.p_M)
     averaged = scaled.averaged(WindowStates(T_M_I, motion, states.h))
     offset = averaged.uv_px - exact.segment.uv_px
     assert np.sqrt(np.mean(offset**2)) < 0.05  # of 0.29 px that a mean of three has
@@ -154,13 +150,13 @@ def test_an_outlier_of_a_neighbour_is_left_out() -> None:
 
 def test_tracks_without_landmarks_and_segments_without_frames_between_stay() -> None:
     exact = case()
-    some = Landmarks(exact.landmarks.track_id[::2], exact.landmarks.p_M[::2])
-    averaged = dataclasses.replace(exact, landmarks=some).averaged()
+    some = dataclasses.replace(exact, track_id=exact.track_id[::2], p_M=exact.p_M[::2])
+    averaged = some.averaged()
     is_other = ~np.isin(exact.segment.track_id, some.track_id)
     assert is_other.any()
     np.testing.assert_array_equal(averaged.sigma_px[is_other], exact.segment.sigma_px[is_other])
     assert np.any(averaged.sigma_px[~is_other] < exact.segment.sigma_px[~is_other])
-    none = Landmarks(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
-    assert dataclasses.replace(exact, landmarks=none).averaged() is exact.segment
+    none = dataclasses.replace(exact, track_id=exact.track_id[:0], p_M=exact.p_M[:0])
+    assert none.averaged() is exact.segment
     alone = dataclasses.replace(exact.segment, between=ObservedFrames.of([]))
     assert dataclasses.replace(exact, segment=alone).averaged() is alone
