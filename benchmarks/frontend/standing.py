@@ -71,7 +71,7 @@ def run(cameras: int, noise_px: float) -> Standing:
     return Standing(
         cameras,
         noise_px,
-        odometry.counts.starts,
+        odometry.starts,
         float(np.linalg.norm(drift)),
         float(pdist(p).max()),
         Counter(motions)["resting"] / len(motions),

@@ -225,11 +225,9 @@ def _saved(vi_map: VIMap, folder: Path, output: OutputOptions) -> tuple[Path, Di
 def _stream_notes(mapping: Mapping) -> list[str]:
     """Return what was left out of the recording, or looks wrong in it."""
     read, notes = mapping.stream.statistics, list(mapping.recording_notes)
-    if read.dropped_before_imu or mapping.odometry.counts.frames_before_imu:
-        count = read.dropped_before_imu + mapping.odometry.counts.frames_before_imu
+    if count := read.dropped_before_imu + mapping.odometry.frames_before_imu:
         notes.append(f"{counted(count, 'frame')} before the first IMU sample left out")
-    if mapping.odometry.waiting_frames and not mapping.is_ended_early:
-        count = mapping.odometry.waiting_frames
+    if (count := mapping.odometry.waiting_frames) and not mapping.is_ended_early:
         notes.append(f"{counted(count, 'frame')} after the last IMU sample left out")
     if any(read.unmatched_images):
         notes.append(

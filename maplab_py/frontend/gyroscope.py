@@ -53,5 +53,5 @@ def _integrate(times_ns, accel_gyro, bias, correction, R):  # type: ignore[no-un
 
 def compile_kernels() -> None:
     """Compile the integration on two samples."""
-    interval = ImuInterval(np.arange(2, dtype=np.int64), np.zeros((2, 6)), 1, 0)
+    interval = ImuInterval(np.arange(2, dtype=np.int64), np.zeros((2, 6)), 1)
     turn(Imu("0" * 32), interval, np.zeros(3))

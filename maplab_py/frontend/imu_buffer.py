@@ -16,7 +16,6 @@ class ImuInterval:
     times_ns: I64  # (S,) both ends included
     accel_gyro: F64  # (S, 6) as measured
     largest_step_ns: int  # between the measured samples that the interval needs
-    saturated: int  # measured samples at a limit of the sensor
 
     @property
     def duration_s(self) -> float:
@@ -35,7 +34,6 @@ class ImuBuffer:
         """Start without samples."""
         self._times_ns = np.zeros(0, dtype=np.int64)
         self._accel_gyro = np.zeros((0, 6))
-        self._is_saturated = np.zeros(0, dtype=np.bool_)
 
     @property
     def first_ns(self) -> int | None:
@@ -70,7 +68,6 @@ class ImuBuffer:
             )
         self._times_ns = np.concatenate([self._times_ns, batch.times_ns])
         self._accel_gyro = np.concatenate([self._accel_gyro, batch.accel_gyro])
-        self._is_saturated = np.concatenate([self._is_saturated, batch.is_saturated])
 
     @property
     def samples(self) -> tuple[I64, F64]:
@@ -100,7 +97,6 @@ class ImuBuffer:
             np.concatenate([[from_ns], times_ns[inside], [to_ns]]).astype(np.int64),
             samples,
             int(np.diff(times_ns[needed]).max()),
-            int(self._is_saturated[first + 1 : last + 1].sum()),
         )
         self.forget_before(to_ns)
         return interval
@@ -111,7 +107,6 @@ class ImuBuffer:
         kept = max(0, kept)
         self._times_ns = self._times_ns[kept:]
         self._accel_gyro = self._accel_gyro[kept:]
-        self._is_saturated = self._is_saturated[kept:]
 
     def _at(self, query_ns: I64) -> F64:
         """Return samples (Q, 6) interpolated linearly at times within those of the samples."""

@@ -20,7 +20,7 @@ from maplab_py.frontend.failures.watch import SensorWatch
 from maplab_py.frontend.imu_buffer import ImuBuffer, ImuInterval
 from maplab_py.frontend.initialization import imu_noise, initializer
 from maplab_py.frontend.motion import MotionDetector
-from maplab_py.frontend.odometry_update import OdometryCounts, OdometryStatus, OdometryUpdate
+from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.interop.recordings.protocol import (
     FrameSet,
     ImuBatch,
@@ -72,7 +72,7 @@ class Odometry:
                 "--imu_calibration_file=FILE, or a --sensor_calibration_file with an IMU"
             )
         self.options = options or odometry_options.OdometryOptions()
-        self.counts = OdometryCounts()
+        self.starts, self.frames_before_imu = 0, 0  # counts
         self._device, self._imu = device, device.imu
         self._make_starter = make_starter or self._initializer
         self._map_rule = map_rule
@@ -114,7 +114,6 @@ class Odometry:
             MapError: Times do not increase, a value is not a number, or an image cannot be read.
         """
         self._buffer.push(batch)
-        self.counts.saturated_samples += int(batch.is_saturated.sum())
         return self._process_waiting()
 
     def push_images(self, frame_set: FrameSet) -> list[OdometryUpdate]:
@@ -173,7 +172,7 @@ class Odometry:
             self._delays.recalibrate(device)
         self._smoother.recalibrate(*rig, self._imu)
         self._gyro_bias, self._newest_turn = self._smoother.states.gyro_bias[-1], None
-        self.counts.starts += 1
+        self.starts += 1
 
     def finish_backfill(self) -> Backfill | None:
         """Read the frames before the start to their end; None when there are none left."""
@@ -218,7 +217,7 @@ class Odometry:
             frame_set = self._waiting.popleft()
             first_ns = self._buffer.first_ns
             if first_ns is not None and frame_set.time_ns + self._delay_ns < first_ns:
-                self.counts.frames_before_imu += 1
+                self.frames_before_imu += 1
                 continue
             updates.append(self._process(frame_set))
         return updates
@@ -261,7 +260,6 @@ class Odometry:
                 interval = None
             else:
                 self._gap_end_ns = -1
-        self.counts.frames += 1
         self._last_ns = time_ns
         measured, failed = interval, ImuPart(0)
         if interval is not None:
@@ -279,8 +277,7 @@ class Odometry:
         update = OdometryUpdate(
             time_ns=time_ns,
             stamp_ns=frame_set.time_ns,
-            status=OdometryStatus.INITIALISING,
-            mission=self.counts.starts - 1,
+            mission=self.starts - 1,
             tracked=tracked,
             motion=motion,
             interval=interval,
@@ -335,7 +332,6 @@ class Odometry:
         is_first = self._gap_end_ns < 0
         self._gap_end_ns = int(interval.times_ns[-1])
         note = self._start_again(f"no IMU samples for {interval.largest_step_ns * 1e-9:.2f} s")
-        self.counts.imu_gaps += is_first
         return note if is_first else "waiting for the end of the gap between IMU samples"
 
     def _tracked(
@@ -393,13 +389,10 @@ class Odometry:
         except EstimationError as error:
             return dataclasses.replace(update, note=self._start_again(str(error)))
         update.stage_ms["window"] = 1e3 * (time.perf_counter() - begin)
-        self.counts.starts += 1
+        self.starts += 1
         self._gyro_bias = state.gyro_bias[0]
         self._speed_mps = float(np.linalg.norm(state.v_M[0]))
-        return dataclasses.replace(
-            update, status=OdometryStatus.TRACKING, mission=self.counts.starts - 1, interval=None,
-            state=state,
-        )  # fmt: skip
+        return dataclasses.replace(update, mission=self.starts - 1, interval=None, state=state)
 
     def _started(self, start: starting.Start) -> NavState:
         """Start the smoother, and add the frames that have come since; return the newest state."""
@@ -476,7 +469,6 @@ class Odometry:
         self._backfiller.check_scale(smoother, update.stamp_ns, frame, self._buffer.samples)
         return dataclasses.replace(
             self._advance_backfill(update),
-            status=OdometryStatus.TRACKING,
             state=result.state,
             released=result.released,
             window=result,

@@ -1,7 +1,6 @@
 """Result of the odometry after each frame."""
 
 import dataclasses
-from enum import Enum
 
 import numpy as np
 
@@ -14,30 +13,11 @@ from maplab_py.vimap.nav_state import NavState
 from maplab_py.vision.tracking.tracks import TrackedImages
 
 
-class OdometryStatus(Enum):
-    """State of the estimator."""
-
-    INITIALISING = "initialising"
-    TRACKING = "tracking"
-
-
-@dataclasses.dataclass(eq=False)
-class OdometryCounts:
-    """Counts of the odometry."""
-
-    frames: int = 0
-    frames_before_imu: int = 0
-    saturated_samples: int = 0
-    imu_gaps: int = 0  # that made it start again
-    starts: int = 0
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class OdometryUpdate:
     """The result of one frame set."""
 
     time_ns: int
-    status: OdometryStatus
     mission: int  # counts starts of the estimator from 0; -1 before the first
     tracked: TrackedImages
     motion: Motion
@@ -60,7 +40,7 @@ class OdometryUpdate:
     def window_frame(self) -> WindowFrame:
         """Return the frame as the smoother takes it."""
         cameras = self.tracked.cameras
-        none = ImuInterval(np.array([self.time_ns] * 2), np.zeros((2, 6)), 0, 0)
+        none = ImuInterval(np.array([self.time_ns] * 2), np.zeros((2, 6)), 0)
         interval = self.interval or none
         return WindowFrame(
             time_ns=self.time_ns,

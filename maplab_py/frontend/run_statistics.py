@@ -9,7 +9,7 @@ from array import array
 import numpy as np
 
 from maplab_py import kernel_cache
-from maplab_py.frontend.odometry_update import OdometryStatus, OdometryUpdate
+from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.frontend.reports import EstimatorStart, StageTime
 
 _GROUPS = {
@@ -113,7 +113,7 @@ class RunStatistics:
             recent = np.asarray(self.stage_ms[-_RECENT * len(_STAGES) :]).reshape(-1, len(_STAGES))
             spent_ms = max(float(np.median(recent.sum(axis=1))), 1e-3)
             parts.append(f"{frame_ms / spent_ms:.2g} x real time")
-        if update.status is OdometryStatus.INITIALISING:
+        if update.state is None:
             parts.append(f"not started: {update.note}" if update.note else "not started")
         parts.append(f"{tracks} tracks")
         if update.window is not None:

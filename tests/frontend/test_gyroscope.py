@@ -24,7 +24,7 @@ def test_it_is_the_turn_of_the_preintegration(
     imu = dataclasses.replace(Imu("0" * 32), intrinsics=intrinsics)
     times_ns = np.cumsum(rng.integers(1_000_000, 6_000_000, samples))
     slow = np.linspace(0.0, 1.0, samples)[:, None] * rng.normal(size=6) + rng.normal(size=6)
-    interval = ImuInterval(times_ns, slow, 6_000_000, 0)
+    interval = ImuInterval(times_ns, slow, 6_000_000)
     bias = rng.normal(scale=0.05, size=3)
     data = InertialData(np.array([0, samples]), times_ns, slow, (imu,), np.zeros(1, dtype=np.int64))
     expected = so3.to_matrix(integrate(data, bias, np.zeros(3)).q_A_B[0])

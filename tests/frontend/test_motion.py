@@ -28,7 +28,7 @@ def interval(frame: int, amplitude: float, frames_hz: float = 20.0) -> ImuInterv
     accel_gyro = np.zeros((len(times_ns), 6))
     accel_gyro[:, 2] = 9.81
     accel_gyro[:, 0] = amplitude * np.sin(2 * np.pi * 10.0 * times_ns * 1e-9)
-    return ImuInterval(times_ns, accel_gyro, STEP_NS, 0)
+    return ImuInterval(times_ns, accel_gyro, STEP_NS)
 
 
 def last(

@@ -131,7 +131,7 @@ _CAMERA = Camera(
 
 def _interval(frame: int, accel_gyro: np.ndarray) -> ImuInterval:
     times_ns = np.linspace((frame - 1) * _FRAME_NS, frame * _FRAME_NS, len(accel_gyro))
-    return ImuInterval(times_ns.astype(np.int64), accel_gyro, _FRAME_NS // 10, 0)
+    return ImuInterval(times_ns.astype(np.int64), accel_gyro, _FRAME_NS // 10)
 
 
 def _resting(rng: np.random.Generator) -> np.ndarray:
