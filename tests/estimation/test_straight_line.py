@@ -7,7 +7,7 @@ import pytest
 
 from maplab_py.array_types import F64
 from maplab_py.compilation import compiled, numba
-from maplab_py.estimation.codegen.straight_line import straight_line
+from maplab_py.estimation.codegen.straight_line import row, rows_of_six, straight_line
 
 
 def all_operations(x: F64, y: F64) -> None:
@@ -33,13 +33,30 @@ def remainder(x: F64, y: F64) -> None:
     y[0] = x[0] % 3.0
 
 
-lowered = straight_line(all_operations)
+FIRST = 2
+
+
+def of_rows(S: F64, k: int, Y: F64, z: float, y: F64) -> None:
+    """Have rows, numbers, loops and computed indices."""
+    p = Y[k + 1, 0]
+    q = row(y[FIRST], y[3], y[4], y[5], y[6], z)
+    for c in range(6):
+        S[k, c] = S[k, c] - Y[k, 1, c] * p + q
+    S[k + 1, 0] = z * q - p / y[FIRST + 2 * 1]
+
+
+lowered, lowered_rows = straight_line(all_operations), rows_of_six(of_rows)
 without_instruction = straight_line(remainder)
 
 
 @compiled()
 def run(x: F64, y: F64) -> None:
     lowered(x, y)
+
+
+@compiled()
+def run_rows(S: F64, k: int, Y: F64, z: float, y: F64) -> None:
+    lowered_rows(S, k, Y, z, y)
 
 
 @compiled()
@@ -53,6 +70,15 @@ def test_it_computes_what_python_does(values: tuple[float, float]) -> None:
     all_operations(x, expected)
     run(x, found)
     np.testing.assert_allclose(found, expected, rtol=1e-15)
+
+
+def test_it_computes_rows_as_numpy_does() -> None:
+    random = np.random.default_rng(4)
+    S, Y, y = random.normal(size=(4, 6, 6)), random.normal(size=(4, 3, 6)), random.normal(size=9)
+    expected = S.copy()
+    of_rows(expected, 2, Y, 0.7, y)
+    run_rows(S, 2, Y, 0.7, y)
+    np.testing.assert_allclose(S, expected, rtol=1e-14, atol=1e-14)
 
 
 def test_it_refuses_other_statements_and_other_arrays() -> None:

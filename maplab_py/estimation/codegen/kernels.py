@@ -12,7 +12,7 @@ from maplab_py.sensors.camera import DISTORTION_SIZE, MIRROR_NAMES, Distortion, 
 _HEADER = (
     '"""Generated; do not edit."""\n\n'
     "import math\n\nimport numpy as np\nfrom maplab_py.compilation import compiled, prange\n\n"
-    "from maplab_py.estimation.codegen.straight_line import straight_line\n"
+    "from maplab_py.estimation.codegen.straight_line import row, rows_of_six, straight_line\n"
     "from maplab_py.estimation.kernels.loss import rho_and_weight\n\n"
 )
 _FAST = '@compiled(fastmath={"contract", "nsz"}, forceinline=True)\n'

@@ -56,9 +56,8 @@ class VisualTarget(NamedTuple):
 class VisualSums(NamedTuple):
     """Normal equations by chunk, before the landmarks' share is subtracted from the blocks."""
 
-    square: F64  # (chunks, V, 6, 6)
+    square: F64  # (chunks, V, 6, 6); its diagonal is that of the unreduced equations
     gradient: F64  # (chunks, V, 6)
-    diagonal: F64  # (chunks, V, 6) of the unreduced equations
     border: F64  # (chunks, C, V, W, 6)
     camera_square: F64  # (chunks, C, C, W, W)
     camera_gradient: F64  # (chunks, C, W)
@@ -69,7 +68,6 @@ class VisualSums(NamedTuple):
         """Return sums of nothing."""
         return cls(
             np.zeros((chunks, vertices, 6, 6)),
-            np.zeros((chunks, vertices, 6)),
             np.zeros((chunks, vertices, 6)),
             np.zeros((chunks, cameras, vertices, width, 6)),
             np.zeros((chunks, cameras, cameras, width, width)),

@@ -243,7 +243,7 @@ class VisualTerms:
         )  # fmt: skip
         gradient, diagonal = np.zeros((states.num_nodes, 3)), np.zeros((states.num_nodes, 3))
         pose_part(gradient, states)[:] = self._sums.gradient[0]
-        pose_part(diagonal, states)[:] = self._sums.diagonal[0]
+        pose_part(diagonal, states)[:] = np.einsum("vii->vi", self._sums.square[0])
         if places.border is not None:
             self._add_camera_chunks()
             nodes = camera_nodes(states)

@@ -105,17 +105,18 @@ def reproject_only(poses, k, cameras, c, points, landmark, uv, o, out):
     out[0], out[1], out[2] = pixel[0] - uv[o, 0], pixel[1] - uv[o, 1], c2
 
 
-@compiled(fastmath={"contract", "nsz"}, forceinline=True)
-def add_pose(out, n, k, Y, square, grad, diag):
-    """Write W = Q'P of one observation to Y[n]; add P'P to square[k], its diagonal and P'r."""
+@rows_of_six
+def add_pose(out, n, k, Y, square, grad):
+    """Write W = Q'P of one observation to Y[n]; add P'P to square[k] and P'r to grad[k]."""
+    p = row(out[POSE], out[POSE + 2], out[POSE + 4], out[POSE + 6], out[POSE + 8], out[POSE + 10])
+    q = row(
+        out[POSE + 1], out[POSE + 3], out[POSE + 5], out[POSE + 7], out[POSE + 9], out[POSE + 11]
+    )
+    for i in range(3):
+        Y[n, i] = p * out[LANDMARK + 2 * i] + q * out[LANDMARK + 2 * i + 1]
+    grad[k] = grad[k] + (p * out[0] + q * out[1])
     for c in range(6):
-        a, b = out[POSE + 2 * c], out[POSE + 2 * c + 1]
-        for i in range(3):
-            Y[n, i, c] = a * out[LANDMARK + 2 * i] + b * out[LANDMARK + 2 * i + 1]
-        grad[k, c] += a * out[0] + b * out[1]
-        diag[k, c] += a * a + b * b
-        for e in range(6):
-            square[k, c, e] += a * out[POSE + 2 * e] + b * out[POSE + 2 * e + 1]
+        square[k, c] = square[k, c] + (out[POSE + 2 * c] * p + out[POSE + 2 * c + 1] * q)
 
 
 @compiled(fastmath={"contract", "nsz"}, forceinline=True)
@@ -132,28 +133,26 @@ def step_landmark(h, f, g, d):
     return decrease - 2.0 * (h[1] * d[0] * d[1] + h[3] * d[0] * d[2] + h[4] * d[1] * d[2])
 
 
-@compiled(fastmath={"contract", "nsz"}, forceinline=True)
+@rows_of_six
 def subtract_product(S, k, Y, b, a):
-    """Compute S[k] -= Y[b]' Y[a].
-
-    Half the time of an elimination goes here, hence the plain form. Entries are named by all their
-    indices, since a view like Y[b] counts references, which costs as much as the arithmetic. The
-    compiler has to assume that S and Y overlap: what is read before the first number is written it
-    need not read again. And each product is subtracted on its own, which is one instruction.
-    """
-    p0, p1, p2, p3, p4, p5 = Y[a, 0, 0], Y[a, 0, 1], Y[a, 0, 2], Y[a, 0, 3], Y[a, 0, 4], Y[a, 0, 5]
-    q0, q1, q2, q3, q4, q5 = Y[a, 1, 0], Y[a, 1, 1], Y[a, 1, 2], Y[a, 1, 3], Y[a, 1, 4], Y[a, 1, 5]
-    r0, r1, r2, r3, r4, r5 = Y[a, 2, 0], Y[a, 2, 1], Y[a, 2, 2], Y[a, 2, 3], Y[a, 2, 4], Y[a, 2, 5]
+    """Compute S[k] -= Y[b]' Y[a]: a third of an elimination."""
+    p = Y[a, 0]
+    q = Y[a, 1]
+    r = Y[a, 2]
     for c in range(6):
-        p, q, r = Y[b, 0, c], Y[b, 1, c], Y[b, 2, c]
-        s0 = S[k, c, 0] - p * p0 - q * q0 - r * r0
-        s1 = S[k, c, 1] - p * p1 - q * q1 - r * r1
-        s2 = S[k, c, 2] - p * p2 - q * q2 - r * r2
-        s3 = S[k, c, 3] - p * p3 - q * q3 - r * r3
-        s4 = S[k, c, 4] - p * p4 - q * q4 - r * r4
-        s5 = S[k, c, 5] - p * p5 - q * q5 - r * r5
-        S[k, c, 0], S[k, c, 1], S[k, c, 2] = s0, s1, s2
-        S[k, c, 3], S[k, c, 4], S[k, c, 5] = s3, s4, s5
+        S[k, c] = S[k, c] - Y[b, 0, c] * p - Y[b, 1, c] * q - Y[b, 2, c] * r
+
+
+@rows_of_six
+def eliminate_observation(n, k, f, z0, z1, z2, Y, grad):
+    """Turn W of an observation into Y = L^-1 W and subtract Y' z from grad[k]."""
+    p = Y[n, 0] * f[0]
+    q = (Y[n, 1] - f[1] * p) * f[2]
+    r = (Y[n, 2] - f[3] * p - f[4] * q) * f[5]
+    Y[n, 0] = p
+    Y[n, 1] = q
+    Y[n, 2] = r
+    grad[k] = grad[k] - (p * z0 + q * z1 + r * z2)
 
 
 @compiled(fastmath={"contract", "nsz"}, forceinline=True)
@@ -163,13 +162,7 @@ def eliminate_landmark(first, last, base, pose_of, grad, Y, f, g):
     z1 = (g[1] - f[1] * z0) * f[2]
     z2 = (g[2] - f[3] * z0 - f[4] * z1) * f[5]
     for o in range(first, last):
-        n, k = o - base, pose_of[o]
-        for c in range(6):
-            y0 = Y[n, 0, c] * f[0]
-            y1 = (Y[n, 1, c] - f[1] * y0) * f[2]
-            y2 = (Y[n, 2, c] - f[3] * y0 - f[4] * y1) * f[5]
-            Y[n, 0, c], Y[n, 1, c], Y[n, 2, c] = y0, y1, y2
-            grad[k, c] -= y0 * z0 + y1 * z1 + y2 * z2
+        eliminate_observation(o - base, pose_of[o], f, z0, z1, z2, Y, grad)
 
 
 @compiled(fastmath={"contract", "nsz"}, forceinline=True)
@@ -232,7 +225,7 @@ def subtract_views(plan, slab, base, pose_of, inverse_sigma, Y, target, numbers)
 
 
 @compiled()
-def add_chunks(plan, square, gradient, diagonal, cost, target, numbers):
+def add_chunks(plan, square, gradient, cost, target, numbers):
     """Add the sums of all chunks into chunk 0, always in the same order, and P'P to the system."""
     chunks = square.shape[0]
     for pose in range(square.shape[1]):
@@ -241,7 +234,6 @@ def add_chunks(plan, square, gradient, diagonal, cost, target, numbers):
                 for e in range(6):
                     square[0, pose, c, e] += square[chunk, pose, c, e]
                 gradient[0, pose, c] += gradient[chunk, pose, c]
-                diagonal[0, pose, c] += diagonal[chunk, pose, c]
         add_pose_block(square[0], pose, plan, plan.row_start[pose + 1] - 1, pose, target, numbers)
     for chunk in range(1, chunks):
         cost[0] += cost[chunk]
@@ -344,12 +336,12 @@ def eliminate(data, at, prior, rule, plan, Y, sums, cost, target, numbers):
     start, pose_of, camera_of, uv, inverse_sigma, scale2, uv_motion = data
     poses, extrinsics, parameters, points, timing = at
     loss_kind, damping, move_points = rule
-    square, gradient, diagonal, border, camera_square, camera_gradient, camera_diagonal = sums
+    square, gradient, border, camera_square, camera_gradient, camera_diagonal = sums
     axes, columns = camera_axes(extrinsics), camera_gradient.shape[2]
     for slab in range(len(plan.slab_start) - 1):
         base = start[plan.slab_start[slab]]
         for chunk in prange(len(cost)):
-            grad, diag, pose_square = gradient[chunk], diagonal[chunk], square[chunk]
+            grad, pose_square = gradient[chunk], square[chunk]
             B, C = border[chunk], camera_square[chunk]
             cgrad, cdiag = camera_gradient[chunk], camera_diagonal[chunk]
             V = np.empty((len(extrinsics), 3, columns))
@@ -374,7 +366,7 @@ def eliminate(data, at, prior, rule, plan, Y, sums, cost, target, numbers):
                     loss, factor = weighted(out, inverse_sigma[o], loss_kind, scale2[o])
                     rho += loss
                     add_landmark_sums(out, h, g)
-                    add_pose(out, n, k, Y, pose_square, grad, diag)
+                    add_pose(out, n, k, Y, pose_square, grad)
                     if columns > 0:
                         add_delay_columns(out, uv_motion, timing, o)
                         for w in range(CAMERA, CAMERA + 2 * columns):
@@ -397,7 +389,7 @@ def eliminate(data, at, prior, rule, plan, Y, sums, cost, target, numbers):
             cost[chunk] += total
         if move_points:
             subtract_views(plan, slab, base, pose_of, inverse_sigma, Y, target, numbers)
-    add_chunks(plan, square, gradient, diagonal, cost, target, numbers)
+    add_chunks(plan, square, gradient, cost, target, numbers)
 
 
 @compiled(parallel=True)
