@@ -264,7 +264,7 @@ def limits_of(options: TrackingOptions, focal_px: float) -> TwoPointLimits:
     return TwoPointLimits(
         threshold=float(np.sqrt(2.0 * options.two_pt_ransac_threshold)),
         gate=options.epipolar_gate_px / focal_px,
-        turn_sigma=KNOWN_TURN_SIGMA_RAD,
+        turn_sigma=_KNOWN_TURN_SIGMA_RAD,
         max_iterations=options.two_pt_ransac_max_iterations,
     )
 
@@ -288,10 +288,10 @@ def image_motion(
         seed: Of the draws.
         turned_px: Where the given turn alone takes the keypoints (K, 2), if that is known already.
     """
-    motion = two_point_motion(*rays, R_C1_C0, limits, seed)
+    motion, given = two_point_motion(*rays, R_C1_C0, limits, seed)
     rows = motion.is_inlier
     if turned_px is None or R_C1_C0 is None:
-        turned_px, _ = project(camera, rays[0] @ motion.R_C1_C0.T)
+        turned_px, _ = project(camera, rays[0] @ given.T)
     disparity_px = np.linalg.norm(uv_px[rows] - turned_px[rows], axis=1)
     return ImageMotion(rows, motion.is_still[rows], disparity_px)
 
@@ -309,27 +309,15 @@ def summarise(motions: list[ImageMotion]) -> tuple[float, bool]:
     return float(np.median(disparity)) if len(disparity) else float("nan"), is_turn_only
 
 
-KNOWN_TURN_SIGMA_RAD = 5e-3
-"""Deviation of a turn that the gyroscope predicts: a bias of 0.1 rad/s in an image interval of 50 ms."""
-UNKNOWN_TURN_SIGMA_RAD = 0.1
+_KNOWN_TURN_SIGMA_RAD, _UNKNOWN_TURN_SIGMA_RAD = 5e-3, 0.1
+"""Deviations of turns that the gyroscope predicts, a bias of 0.1 rad/s for 50 ms, and of others."""
 _UNKNOWN_TURN_ROUNDS = (8.0, 4.0, 2.0, 1.0)
 """An unknown turn is refined with thresholds that shrink to the given ones."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class TwoPointMotion:
-    """Motion of a camera between two images, from the rays of tracks."""
-
-    is_inlier: Mask  # (K,) agrees with the turn or with turn and translation
-    is_still: Mask  # (K,) agrees with the turn alone
-    R_C1_C0: F64  # (3, 3) as given, else as estimated
-    R_C1_C0_refined: F64  # (3, 3)
-    direction_C1: F64  # (3,) unit, of the earlier camera from the later one; zero: unknown
-
-
 def two_point_motion(
     ray_C0: F64, ray_C1: F64, R_C1_C0: F64 | None, limits: TwoPointLimits, seed: int
-) -> TwoPointMotion:
+) -> tuple[TwoPointResult, F64]:
     """Separate tracks that agree with the motion of a camera from outliers.
 
     The union of inliers of a turn and of a translation with known turn is maplab's
@@ -341,43 +329,40 @@ def two_point_motion(
         ray_C0: Unit rays (K, 3) of the earlier image.
         ray_C1: Unit rays (K, 3) of the later image.
         R_C1_C0: Turn (3, 3) as predicted by the gyroscope, None when it is unknown.
-        limits: Thresholds; `turn_sigma` is replaced.
+        limits: Thresholds for a turn that the gyroscope predicts.
         seed: Of the draws.
+
+    Returns:
+        The motion, and the turn R_C1_C0 (3, 3) that it corrects: as given, else as estimated.
     """
     word = np.uint64(seed % 2**64)
     if R_C1_C0 is not None:
         given = np.array(R_C1_C0, dtype=np.float64)
-        return _search(
-            ray_C0, ray_C1, given, limits._replace(turn_sigma=KNOWN_TURN_SIGMA_RAD), word
-        )
+        return _search(ray_C0, ray_C1, given, limits, word), given
     turn = np.eye(3)
     search_turn(ray_C0, ray_C1, limits, word, turn)
-    for factor in _UNKNOWN_TURN_ROUNDS:
-        wide = TwoPointLimits(
+    *wide, last = (
+        TwoPointLimits(
             factor * limits.threshold,
             factor * limits.gate,
-            UNKNOWN_TURN_SIGMA_RAD,
+            _UNKNOWN_TURN_SIGMA_RAD,
             limits.max_iterations,
         )
-        motion = _search(ray_C0, ray_C1, turn, wide, word)
-        turn = motion.R_C1_C0_refined
-    return motion
+        for factor in _UNKNOWN_TURN_ROUNDS
+    )
+    for of_round in wide:
+        motion = _search(ray_C0, ray_C1, turn, of_round, word)
+        turn = so3.to_matrix(so3.exp(motion.turn)) @ turn
+    return _search(ray_C0, ray_C1, turn, last, word), turn
 
 
 def _search(
     ray_C0: F64, ray_C1: F64, R_C1_C0: F64, limits: TwoPointLimits, word: np.uint64
-) -> TwoPointMotion:
+) -> TwoPointResult:
     count = len(ray_C0)
     result = TwoPointResult(
         np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_), np.zeros(3), np.zeros(3)
     )
     turned = np.ascontiguousarray(ray_C0 @ R_C1_C0.T)
     search_two_point(turned, ray_C1, limits, word, result)
-    correction = so3.to_matrix(so3.exp(result.turn))
-    return TwoPointMotion(
-        is_inlier=result.is_inlier,
-        is_still=result.is_still,
-        R_C1_C0=R_C1_C0,
-        R_C1_C0_refined=correction @ R_C1_C0,
-        direction_C1=result.direction,
-    )
+    return result
