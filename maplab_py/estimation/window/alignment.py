@@ -15,7 +15,7 @@ from maplab_py.estimation.problem.protocol import Step
 from maplab_py.estimation.problem.solver import SolverOptions, optimize_states
 from maplab_py.estimation.window.map_terms import MapTerms
 from maplab_py.estimation.window.states import WindowStates
-from maplab_py.geometry import so3
+from maplab_py.geometry import se3, so3
 from maplab_py.progress import SILENT
 
 _SMALLEST_DAMPED, _LARGEST_DAMPED = 1e-6, 1e32
@@ -85,7 +85,7 @@ class AlignmentProblem:
         return float(np.linalg.norm(states.T_G_M))
 
     def _prior(self, states: WindowStates) -> tuple[F64, F64]:
-        offset = states.offsets(states.T_M_I, states.motion, self._T_G_M[None])[-6:]
+        offset = se3.local(self._T_G_M, states.T_G_M[0])
         slope = np.eye(6)
         slope[3:, 3:] = so3.right_jacobian_inverse(offset[3:])
         return offset / self._sigma, slope / self._sigma[:, None]

@@ -35,7 +35,7 @@ def marginalized(
     information = np.tril(lower) + np.tril(lower, -1).T
     fixed, is_base_fixed = prior.is_fixed, prior.is_base_fixed
     x0 = prior.linearization_point(states)
-    offset = states.offsets(x0.T_M_I, x0.motion, x0.T_G_M, x0.calibration)
+    offset = states.offsets(x0)
     gradient = linear.system.reduced_gradient - information @ offset
     if frame is not None:
         rows = FRAME_SIZE * frame + np.arange(FRAME_SIZE)

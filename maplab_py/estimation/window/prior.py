@@ -28,12 +28,9 @@ class WindowPrior:
 
     root: F64  # (k, 15 F + K + 6 B)
     residual: F64  # (k,)
-    T_M_I: F64  # (F, 7) x0
-    motion: F64  # (F, 9) x0
+    x0: WindowStates  # whose landmarks do not count
     is_fixed: Mask  # (F,)
-    T_G_M: F64 = dataclasses.field(default_factory=lambda: np.zeros((0, 7)))  # (B, 7) x0
     is_base_fixed: bool = False
-    calibration: F64 = dataclasses.field(default_factory=lambda: np.zeros(0))  # (K,) x0
 
     @classmethod
     def of_state(
@@ -56,16 +53,14 @@ class WindowPrior:
         known = np.flatnonzero(np.isfinite(sigma))
         root = np.zeros((len(known), len(sigma)))
         root[np.arange(len(known)), known] = 1.0 / sigma[known]
-        is_fixed = np.zeros(1, dtype=np.bool_)
-        return cls(
-            root, np.zeros(len(known)), T_M_I[None], motion[None], is_fixed, calibration=mean
-        )
+        x0 = WindowStates(T_M_I[None], motion[None], np.zeros((0, 3)), calibration=mean)
+        return cls(root, np.zeros(len(known)), x0, np.zeros(1, dtype=np.bool_))
 
     @classmethod
     def of_information(
-        cls, information: F64, gradient: F64, states: WindowStates, is_fixed: Mask
+        cls, information: F64, gradient: F64, x0: WindowStates, is_fixed: Mask
     ) -> WindowPrior:
-        """Return the root form of normal equations (n, n), (n,) at x0 = `states`.
+        """Return the root form of normal equations (n, n), (n,) at x0.
 
         The information may be singular: the root comes from Cholesky with pivoting, of the matrix
         scaled to a unit diagonal, and has as many rows as there are directions with information.
@@ -80,10 +75,7 @@ class WindowPrior:
         root[:, rows[order]] = factor * scale[order]
         right = (gradient[rows] / scale)[order][:rank]
         residual, _ = scipy.linalg.lapack.dtrtrs(factor[:, :rank], right, lower=0, trans=1)
-        return cls(
-            root, residual, states.T_M_I, states.motion, is_fixed, states.T_G_M,
-            calibration=states.calibration,
-        )  # fmt: skip
+        return cls(root, residual, x0, is_fixed)
 
     @cached_property
     def information(self) -> F64:
@@ -103,11 +95,11 @@ class WindowPrior:
 
     @property
     def _frame_columns(self) -> int:
-        return FRAME_SIZE * len(self.T_M_I)
+        return FRAME_SIZE * len(self.x0)
 
     @property
     def _base_columns(self) -> int:
-        return self._frame_columns + len(self.calibration)
+        return self._frame_columns + len(self.x0.calibration)
 
     @cached_property
     def _free(self) -> I64:
@@ -117,21 +109,17 @@ class WindowPrior:
             columns = np.append(columns, self._base_columns + 3)
         return columns
 
-    def offsets(self, states: WindowStates) -> F64:
-        """Return the tangent vectors from x0 to some states."""
-        return states.offsets(self.T_M_I, self.motion, self.T_G_M, self.calibration)
-
     def linearization_point(self, states: WindowStates) -> WindowStates:
         """Return the states at x0 where that is fixed, as they are elsewhere."""
         T_M_I, motion = states.T_M_I.copy(), states.motion.copy()
         fixed = self.is_fixed
-        T_M_I[fixed], motion[fixed] = self.T_M_I[fixed], self.motion[fixed]
-        T_G_M = self.T_G_M if self.is_base_fixed else states.T_G_M
+        T_M_I[fixed], motion[fixed] = self.x0.T_M_I[fixed], self.x0.motion[fixed]
+        T_G_M = self.x0.T_G_M if self.is_base_fixed else states.T_G_M
         return dataclasses.replace(states, T_M_I=T_M_I, motion=motion, T_G_M=T_G_M)
 
     def evaluate(self, states: WindowStates) -> F64:
         """Return the residual (k,) at some states."""
-        return np.asarray(self.root @ self.offsets(states) + self.residual)
+        return np.asarray(self.root @ states.offsets(self.x0) + self.residual)
 
     def linearized(self, states: WindowStates) -> tuple[F64, F64, F64]:
         """Return residual (k,), its Jacobian's square (n, n), and gradient (n,), n = 15 F + K + 6 B.
@@ -139,7 +127,7 @@ class WindowPrior:
         The Jacobian of a fixed frame is that at x0; of the others the exact one, which differs by
         the right Jacobian of the rotation from x0.
         """
-        offset = self.offsets(states)
+        offset = states.offsets(self.x0)
         residual = np.asarray(self.root @ offset + self.residual)
         free = self._free
         if not len(free):
@@ -157,8 +145,7 @@ class WindowPrior:
         return dataclasses.replace(
             self,
             root=np.concatenate([frames, padding, base], axis=1),
-            T_M_I=np.concatenate([self.T_M_I, T_M_I[None]]),
-            motion=np.concatenate([self.motion, motion[None]]),
+            x0=self.x0.with_frame(T_M_I, motion),
             is_fixed=np.append(self.is_fixed, False),
         )
 
@@ -170,38 +157,28 @@ class WindowPrior:
         root[:rows, :columns] = prior.root
         root[rows:, columns:] = np.diag(1.0 / sigma)
         residual = np.concatenate([prior.residual, np.zeros(6)])
-        T_G_M = T_G_M[None]
-        return dataclasses.replace(
-            prior, root=root, residual=residual, T_G_M=T_G_M, is_base_fixed=False
-        )
+        x0 = dataclasses.replace(prior.x0, T_G_M=T_G_M[None])
+        return dataclasses.replace(prior, root=root, residual=residual, x0=x0, is_base_fixed=False)
 
     def without_base(self) -> WindowPrior:
         """Return the prior of the frames: what it says of the base frame is marginalised."""
-        if not len(self.T_G_M):
+        if not len(self.x0.T_G_M):
             return self
-        x0 = WindowStates(self.T_M_I, self.motion, np.zeros((0, 3)), calibration=self.calibration)
+        x0 = dataclasses.replace(self.x0, T_G_M=np.zeros((0, 7)))
         return self._without(self._base_columns + np.arange(6), x0, self.is_fixed)
 
     def without_frame(self, frame: int) -> WindowPrior:
         """Return the prior of all other frames: what it says of this frame is marginalised."""
         columns = FRAME_SIZE * frame + np.arange(FRAME_SIZE)
-        x0 = WindowStates(
-            np.delete(self.T_M_I, frame, axis=0),
-            np.delete(self.motion, frame, axis=0),
-            np.zeros((0, 3)),
-            self.T_G_M,
-            calibration=self.calibration,
-        )
-        return self._without(columns, x0, np.delete(self.is_fixed, frame))
+        is_fixed = np.delete(self.is_fixed, frame)
+        return self._without(columns, self.x0.without_frame(frame), is_fixed)
 
     def _without(self, columns: I64, x0: WindowStates, is_fixed: Mask) -> WindowPrior:
         """Return the prior with some columns marginalised; x0 is that of the others."""
         is_base_fixed = self.is_base_fixed and len(x0.T_G_M) > 0
         if not self.root[:, columns].any():
             root = np.delete(self.root, columns, axis=1)
-            result = dataclasses.replace(
-                self, root=root, T_M_I=x0.T_M_I, motion=x0.motion, is_fixed=is_fixed, T_G_M=x0.T_G_M
-            )
+            result = dataclasses.replace(self, root=root, x0=x0, is_fixed=is_fixed)
         else:
             information, gradient = schur_complement(
                 self.information, self.root.T @ self.residual, columns

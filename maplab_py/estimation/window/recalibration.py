@@ -83,24 +83,19 @@ class WindowChange:
     ) -> WindowPrior:
         """Return the prior of the new states, for the window's states before the change."""
         T_new_old = self._moved_frame(states)
-        at = WindowStates(
-            np.concatenate([prior.T_M_I, states.T_M_I[-1:]]),
-            np.concatenate([prior.motion, states.motion[-1:]]), np.zeros((0, 3)),
-        )  # fmt: skip
+        at = prior.x0.with_frame(states.T_M_I[-1], states.motion[-1])
         moved = self.states(at, np.concatenate([rate_I, rate_I[-1:]]), mean)
         root = prior.root.copy()
         R_M, R_I = so3.to_matrix(T_new_old[:4]), so3.to_matrix(self.T_old_new[:4])
         for frame in np.flatnonzero(prior.touched):
             slope = np.eye(FRAME_SIZE)
-            R_M_I = so3.to_matrix(prior.T_M_I[frame, :4])
+            R_M_I = so3.to_matrix(prior.x0.T_M_I[frame, :4])
             slope[:3, :3] = slope[6:9, 6:9] = R_M
             slope[:3, 3:6] = -R_M @ R_M_I @ so3.skew(self.T_old_new[4:])
             slope[3:6, 3:6] = R_I.T
             columns = slice(FRAME_SIZE * frame, FRAME_SIZE * (frame + 1))
             root[:, columns] = root[:, columns] @ np.linalg.inv(slope)
-        result = dataclasses.replace(
-            prior, root=root, T_M_I=moved.T_M_I[:-1], motion=moved.motion[:-1]
-        )
+        result = dataclasses.replace(prior, root=root, x0=moved.without_frame(len(prior.x0)))
         return self._doubted(result, states.T_M_I[-1])
 
     def _doubted(self, prior: WindowPrior, newest: F64) -> WindowPrior:
@@ -116,12 +111,13 @@ class WindowChange:
             return prior
         scales = (_RATE_RADPS, _GRAVITY_MPS2, 1.0)
         sigma = np.concatenate([self.size * np.repeat(scales, 3), [_FREE] * 4])
-        way = np.zeros((len(prior.T_M_I), FRAME_SIZE, 13))
+        x0 = prior.x0
+        way = np.zeros((len(x0), FRAME_SIZE, 13))
         way[:, 9:15, :6] = np.eye(6)
-        offset, v_M = prior.T_M_I[:, 4:] - newest[4:], prior.motion[:, :3]
+        offset, v_M = x0.T_M_I[:, 4:] - newest[4:], x0.motion[:, :3]
         turns = [6, 7, 12]  # about the axes of M
         way[:, :3, turns] = np.cross(np.eye(3), offset[:, None]).transpose(0, 2, 1)
-        way[:, 3:6, turns] = so3.to_matrix(prior.T_M_I[:, :4]).transpose(0, 2, 1)
+        way[:, 3:6, turns] = so3.to_matrix(x0.T_M_I[:, :4]).transpose(0, 2, 1)
         way[:, 6:9, turns] = np.cross(np.eye(3), v_M[:, None]).transpose(0, 2, 1)
         way[:, :3, 8], way[:, 6:9, 8] = offset, v_M
         way[:, :3, 9:12] = np.eye(3)
@@ -135,6 +131,6 @@ class WindowChange:
         here[:3, -FRAME_SIZE : 3 - FRAME_SIZE] = np.eye(3)
         here[3, 3 - FRAME_SIZE : 6 - FRAME_SIZE] = so3.to_matrix(newest[:4])[2]
         information += here.T @ here / _HERE**2
-        T_M_I = np.concatenate([prior.T_M_I[:-1], newest[None]])
-        x0 = WindowStates(T_M_I, prior.motion, np.zeros((0, 3)))
+        T_M_I = np.concatenate([x0.T_M_I[:-1], newest[None]])
+        x0 = dataclasses.replace(x0, T_M_I=T_M_I)
         return WindowPrior.of_information(information, gradient, x0, prior.is_fixed)

@@ -51,24 +51,15 @@ class WindowStates:
         calibration = self.calibration + step[first : first + len(self.calibration)]
         return WindowStates(T_M_I, motion, h, self._moved_base(step), self.p_G, calibration)
 
-    def offsets(
-        self,
-        T_M_I: F64,
-        motion: F64,
-        T_G_M: F64 | None = None,
-        calibration: F64 | None = None,
-    ) -> F64:
-        """Return the tangent vectors (15 F + K + 6 B,) from other states to these.
-
-        Without a T_G_M (B, 7) or calibration (K,) these have an offset of zero.
-        """
+    def offsets(self, origin: WindowStates) -> F64:
+        """Return the tangent vectors (15 F + K + 6 B,) from other states to these."""
         of_frames, count = FRAME_SIZE * len(self), len(self.calibration)
         result = np.zeros(of_frames + count + 6 * len(self.T_G_M))
-        kernels.offsets(self.T_M_I, self.motion, T_M_I, motion, result)
-        if calibration is not None and count:
-            result[of_frames : of_frames + count] = self.calibration - calibration
-        if T_G_M is not None and len(T_G_M):
-            result[-6:] = se3.local(T_G_M[0], self.T_G_M[0])
+        kernels.offsets(self.T_M_I, self.motion, origin.T_M_I, origin.motion, result)
+        if count:
+            result[of_frames : of_frames + count] = self.calibration - origin.calibration
+        if len(origin.T_G_M):
+            result[-6:] = se3.local(origin.T_G_M[0], self.T_G_M[0])
         return result
 
     def _moved_base(self, step: F64) -> F64:

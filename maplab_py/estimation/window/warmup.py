@@ -89,7 +89,7 @@ def _run_frames() -> None:
     first_row = np.zeros(1, dtype=np.int64)
     kernels.add_factors(np.ones((1, 3)), np.ones((1, 3, 3)), first_row, system)
     kernels.add_walks(states.motion, np.ones((1, 2)), system)
-    states.moved(states.offsets(states.T_M_I, states.motion), states.h)
+    states.moved(states.offsets(states), states.h)
     cameras.CameraPoses.of(states.T_M_I, se3.identity(1))
     origin, start = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), np.array([0, 2], dtype=np.int64)
     ray = np.array([[0.0, 0.0, 1.0], [-0.6, 0.0, 0.8]])

@@ -242,8 +242,8 @@ class Refinement:
         root[7:10, 12:15] = np.eye(3) / self._bias_sigmas[1]
         motion = states.motion.copy()
         motion[:, 3:] = 0.0
-        is_fixed = np.zeros(len(states), dtype=np.bool_)
-        return WindowPrior(root, np.zeros(10), states.T_M_I, motion, is_fixed)
+        x0 = dataclasses.replace(states, motion=motion)
+        return WindowPrior(root, np.zeros(10), x0, np.zeros(len(states), dtype=np.bool_))
 
     def _observations(self, segment: Segment) -> tuple[I64, Observations]:
         """Return the rows of a segment's observations that have rays, and these observations."""

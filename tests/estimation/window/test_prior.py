@@ -57,7 +57,7 @@ def test_marginalising_step_by_step_equals_all_at_once() -> None:
     error = (stepwise.information - H_once) / (unit[:, None] * unit)
     assert np.abs(error).max() < 1e-9
     np.testing.assert_allclose(stepwise.root.T @ stepwise.residual, g_once, rtol=1e-9, atol=1e-9)
-    np.testing.assert_array_equal(stepwise.T_M_I, states.T_M_I[[1, 3]])
+    np.testing.assert_array_equal(stepwise.x0.T_M_I, states.T_M_I[[1, 3]])
 
 
 def test_cost_of_the_prior_is_the_least_of_the_joint_cost() -> None:
@@ -128,7 +128,7 @@ def run_without_gauge(tracks: SimulatedTracks) -> tuple[WindowPrior, F64]:
         first_ns.add(int(smoother.times_ns[0]))
     assert len(first_ns) > 4  # so many less one have been marginalised
     prior = smoother.prior
-    x0 = WindowStates(prior.T_M_I, prior.motion, np.zeros((0, 3)))
+    x0 = prior.x0
     gauge = gauge_directions(x0)
     scale = np.sqrt(np.maximum(np.diagonal(prior.information), 1e-300))
     along = np.linalg.norm(prior.root @ gauge, axis=0)

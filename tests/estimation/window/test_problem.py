@@ -57,7 +57,7 @@ def at_first_estimates(smoother: FixedLagSmoother) -> tuple[WindowProblem, Windo
     problem, states = smoother.problem()
     prior, fixed = smoother.prior, smoother.prior.is_fixed
     T_M_I, motion = states.T_M_I.copy(), states.motion.copy()
-    T_M_I[fixed], motion[fixed] = prior.T_M_I[fixed], prior.motion[fixed]
+    T_M_I[fixed], motion[fixed] = prior.x0.T_M_I[fixed], prior.x0.motion[fixed]
     return problem, WindowStates(T_M_I, motion, states.h)
 
 
