@@ -7,7 +7,7 @@ from pathlib import Path
 
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions, TrackReport
 from maplab_py.algorithms.landmarks.tracks import init_tracks
-from maplab_py.array_types import F64, I64, U8
+from maplab_py.array_types import F64, U8
 from maplab_py.errors import EstimationError
 from maplab_py.frontend.backfill import Backfill
 from maplab_py.frontend.dead_reckoning import Tie, tied
@@ -25,7 +25,11 @@ _MIN_VERTICES = 2
 
 
 class MapBuilder:
-    """Collects vertices; `finish` makes the map. Each start of the odometry is a mission of the map."""
+    """Collects vertices; `finish` makes the map. Each start of the odometry is a mission of the map.
+
+    Attributes:
+        missions: Records of all missions, those without vertices included; the last one grows.
+    """
 
     def __init__(
         self,
@@ -50,19 +54,14 @@ class MapBuilder:
         self._images = None
         if self._options.save_image_as_resources:
             self._images = NewResources(staging_parent, seed=seed)
-        self._missions: list[RecordedMission] = []
+        self.missions: list[RecordedMission] = []
         self._devices: list[RecordedSensors] = []  # of the missions
         self._waiting: dict[int, tuple[VertexFrames, list[int]]] = {}
 
     @property
-    def missions(self) -> int:
-        """Number of missions, those without vertices included."""
-        return len(self._missions)
-
-    @property
     def vertices(self) -> int:
         """Number of vertices of all missions."""
-        return sum(len(mission) for mission in self._missions)
+        return sum(len(mission) for mission in self.missions)
 
     def start_mission(self, device: RecordedSensors | None = None) -> None:
         """Begin a mission: the next vertex is its root.
@@ -72,34 +71,17 @@ class MapBuilder:
                 other ids, so that both are in the map; under the same ids they replace those before.
         """
         self._device = new = device or self._device
-        self._missions.append(RecordedMission())
+        self.missions.append(RecordedMission())
         ids = new.imu_id, new.rig_id
         self._devices = [new if (d.imu_id, d.rig_id) == ids else d for d in self._devices] + [new]
 
     def calibrate(self, device: RecordedSensors) -> None:
         """Take the sensors with another calibration, for all missions."""
-        self._device, self._devices = device, [device] * len(self._missions)
-
-    def add_imu(self, times_ns: I64, accel_gyro: F64) -> None:
-        """Add the samples (S, 6) between two frames, those at the times of both included.
-
-        Samples before the first vertex of a mission are not kept.
-        """
-        self._missions[-1].add_imu(times_ns, accel_gyro)
-
-    def add_imu_after_end(self, times_ns: I64, accel_gyro: F64) -> None:
-        """Add samples that lead from the end of the present mission towards the next one."""
-        if self._missions:
-            self._missions[-1].add_imu_after_end(times_ns, accel_gyro)
-
-    def doubt_end(self) -> None:
-        """Say that the present mission has diverged: the next one is not tied to it."""
-        if self._missions:
-            self._missions[-1].is_doubtful = True
+        self._device, self._devices = device, [device] * len(self.missions)
 
     def is_due(self, time_ns: int) -> bool:
         """Tell whether a frame of this time becomes a vertex."""
-        last_ns = self._missions[-1].last_ns
+        last_ns = self.missions[-1].last_ns
         return last_ns is None or time_ns - last_ns >= self._interval_ns
 
     @property
@@ -126,7 +108,7 @@ class MapBuilder:
 
     def fill(self, backfill: Backfill) -> None:
         """Make vertices of the frames before the first vertex of the mission, and refine the others."""
-        mission, earlier = self._missions[-1], RecordedMission()
+        mission, earlier = self.missions[-1], RecordedMission()
         first_ns = int(mission.states[0].time_ns[0]) if len(mission) else 0
         for row, frame in enumerate(backfill.frames):
             if frame.time_ns <= first_ns and row:
@@ -158,7 +140,7 @@ class MapBuilder:
             UserError: An image cannot be written.
         """
         rows = self._image_rows(frames, images)
-        self._missions[-1].add_vertex(state, frames, rows, covariance)
+        self.missions[-1].add_vertex(state, frames, rows, covariance)
 
     def _image_rows(self, frames: VertexFrames, images: Sequence[U8 | None]) -> list[int]:
         """Keep images as resources; return their rows, -1 where there is none."""
@@ -173,19 +155,11 @@ class MapBuilder:
             )
         ]
 
-    def refine(self, states: nav_state.NavState) -> None:
-        """Replace the states of vertices of the present mission that have one of these times."""
-        self._missions[-1].refine(states)
-
     def replace_samples(self, watch: SensorWatch) -> None:
         """Replace the samples of parts of the IMU that had failed; see `replace_failed`."""
         assert self._device.imu is not None
-        for mission in self._missions:
+        for mission in self.missions:
             replace_failed(mission, watch, self._device.imu.gravity_magnitude_mps2)
-
-    def drop_after(self, time_ns: int) -> None:
-        """Remove the vertices of the present mission after a time: their states are doubtful."""
-        self._missions[-1].drop_after(time_ns)
 
     def ties(self) -> list[Tie | None]:
         """Return how each mission of the map is tied to the one before; None = it is not, as the first."""
@@ -196,7 +170,7 @@ class MapBuilder:
         return result
 
     def _used_missions(self) -> list[tuple[RecordedMission, RecordedSensors]]:
-        pairs = zip(self._missions, self._devices, strict=True)
+        pairs = zip(self.missions, self._devices, strict=True)
         return [(mission, device) for mission, device in pairs if len(mission) >= _MIN_VERTICES]
 
     def make_map(self) -> VIMap:
@@ -223,23 +197,11 @@ class MapBuilder:
 
         Ids are not those of the whole map.
         """
-        part = self._missions[mission].part(first)
+        part = self.missions[mission].part(first)
         if len(part) < _MIN_VERTICES:
             return None
         vi_map = mission_map(self._devices[mission], part, self._images)
         return init_tracks(vi_map, LandmarkQualityOptions(), across_cameras=True)[0]
-
-    def recorded(self, mission: int) -> RecordedMission:
-        """Return what was recorded of a mission; it may grow."""
-        return self._missions[mission]
-
-    def forget_before(self, mission: int, first: int) -> None:
-        """Remove the vertices of a mission before a row; they are elsewhere."""
-        self._missions[mission].forget_before(first)
-
-    def count(self, mission: int) -> int:
-        """Return the number of vertices of a mission."""
-        return len(self._missions[mission])
 
     def finish(self, *, progress: Progress = SILENT) -> tuple[VIMap, TrackReport]:
         """Return the map with landmarks: tracks are triangulated, and their quality is evaluated.

@@ -150,7 +150,7 @@ class Mapping:
             backfill = self.odometry.finish_backfill()
             if backfill is not None:
                 self.builder.fill(backfill)
-            self.builder.refine(self.odometry.window_states())
+            self.builder.missions[-1].refine(self.odometry.window_states())
             self.builder.replace_samples(self.odometry.watch)
         self.odometry.find_calibration()
         estimate = self.odometry.calibration_estimate
@@ -174,7 +174,7 @@ class Mapping:
     def recalibrate(self, device: protocol.RecordedSensors) -> None:
         """Go on with another calibration, of sensors with other ids; see `Odometry.recalibrate`."""
         if self.builder is not None:
-            self.builder.refine(self.odometry.window_states())
+            self.builder.missions[-1].refine(self.odometry.window_states())
         self.odometry.recalibrate(device)
         self.statistics.expect_start("another calibration")
 
@@ -256,13 +256,14 @@ class Mapping:
         return min(filter(None, (chosen_s, known_s)), default=0.0)
 
     def _build(self, update: OdometryUpdate, builder: map_builder.MapBuilder) -> None:
-        if update.healthy_until_ns:
-            builder.drop_after(update.healthy_until_ns)
-        if update.has_diverged:
-            builder.doubt_end()
         is_between = update.state is None or update.mission != self._mission
-        if is_between and update.since_last is not None:
-            builder.add_imu_after_end(update.since_last.times_ns, update.since_last.accel_gyro)
+        if builder.missions:
+            before = builder.missions[-1]
+            if update.healthy_until_ns:
+                before.drop_after(update.healthy_until_ns)
+            before.is_doubtful |= update.has_diverged
+            if is_between and update.since_last is not None:
+                before.add_imu_after_end(update.since_last.times_ns, update.since_last.accel_gyro)
         if update.state is None:
             self._keep_before_start(update, builder)
             return
@@ -270,9 +271,9 @@ class Mapping:
             builder.start_mission(self.odometry.device)
             self._mission = update.mission
         elif update.interval is not None:
-            builder.add_imu(update.interval.times_ns, update.interval.accel_gyro)
+            builder.missions[-1].add_imu(update.interval.times_ns, update.interval.accel_gyro)
         if update.released is not None:
-            builder.refine(update.released)
+            builder.missions[-1].refine(update.released)
         if builder.is_due(update.time_ns):
             covariance = None if update.window is None else update.window.covariance
             builder.add_vertex(update.state, self._keypoints.of(update), update.images, covariance)

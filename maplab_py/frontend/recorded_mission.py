@@ -52,7 +52,7 @@ class RecordedMission:
         return int(self.states[-1].time_ns[0]) if self.states else None
 
     def add_imu(self, times_ns: I64, accel_gyro: F64) -> None:
-        """Add samples; the first repeats the last sample that was added."""
+        """Add samples, the first being the last one before; until there is a vertex none are kept."""
         if self.states:
             self._samples.append((times_ns, accel_gyro))
 

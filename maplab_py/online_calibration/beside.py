@@ -60,9 +60,9 @@ class CalibrationBeside:
         builder = mapping.builder
         if builder is None or update.released is None or not len(update.released):
             return
-        if builder.missions - 1 != self._mission:
-            self._mission, self._begin_ns = builder.missions - 1, 0
-        recorded = builder.recorded(self._mission)
+        if len(builder.missions) - 1 != self._mission:
+            self._mission, self._begin_ns = len(builder.missions) - 1, 0
+        recorded = builder.missions[self._mission]
         if not self._begin_ns and len(recorded) > 1:
             self._begin_ns = int(recorded.states[0].time_ns[0])
             # clocks may start anew with every recording; samples do not repeat
@@ -161,7 +161,7 @@ class CalibrationBeside:
         """Wait for what is left, unless the user wants the end; put notes into the run's report."""
         progress.line("evaluate the last segments of the self-calibration")
         if mapping.builder is not None and self._mapping is mapping and self._begin_ns:
-            recorded = mapping.builder.recorded(self._mission)
+            recorded = mapping.builder.missions[self._mission]
             if recorded.last_ns is not None:
                 self._cut(recorded, recorded.last_ns, OPTIONS.segment_keyframes // 2 + 1)
         self._hand_on(None)

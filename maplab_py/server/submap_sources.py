@@ -48,19 +48,20 @@ class SubmapWriter:
         builder = mapping.builder
         if builder is None or update.state is None or not builder.missions:
             return
-        if builder.missions - 1 != self._mission:
-            self.is_whole &= builder.missions - 1 == self._mission + 1 and (
-                self._mission < 0 or self._first >= builder.count(self._mission) - 1
+        newest = len(builder.missions) - 1
+        if newest != self._mission:
+            self.is_whole &= newest == self._mission + 1 and (
+                self._mission < 0 or self._first >= len(builder.missions[self._mission]) - 1
             )
-            self._mission, self._first = builder.missions - 1, 0
+            self._mission, self._first = newest, 0
             self._start_ns = self._begin_ns = update.time_ns
         if update.time_ns - self._begin_ns >= 1e9 * self._output.submap_interval_s:
-            builder.refine(mapping.odometry.window_states())
+            builder.missions[-1].refine(mapping.odometry.window_states())
             self._push(mapping)
             self._begin_ns = update.time_ns
             if self._forgets and self._first > 1:
                 # two vertices stay, so that there is always a map
-                builder.forget_before(self._mission, self._first - 1)
+                builder.missions[self._mission].forget_before(self._first - 1)
                 self._first = 1
 
     def finish(self, mapping: Mapping) -> None:
@@ -70,7 +71,7 @@ class SubmapWriter:
 
     def _push(self, mapping: Mapping) -> None:
         builder = mapping.builder
-        if builder is None or self._first >= builder.count(self._mission):
+        if builder is None or self._first >= len(builder.missions[self._mission]):
             return
         submap = builder.make_part(self._mission, self._first)
         if submap is None:
@@ -81,7 +82,7 @@ class SubmapWriter:
             save_map(submap, Path(folder) / name)
             push(self._spool, self._output.robot_name, Path(folder) / name)
         self.pushed += 1
-        self._first = builder.count(self._mission) - 1
+        self._first = len(builder.missions[self._mission]) - 1
 
 
 _LONGEST_SLEEP_S = 0.1

@@ -144,7 +144,7 @@ def test_a_proposal_is_used_at_once_or_refused_in_one_note(
     mapping = Mapping(recording, observer=Proposing(), make_starter=start)
     mapping.run()
     assert mapping.builder is not None
-    assert mapping.builder.missions == (1 if is_damaged else 2)
+    assert len(mapping.builder.missions) == (1 if is_damaged else 2)
     notes = [note for note in mapping.statistics.notes if "another calibration" in note]
     refusals = [note for note in mapping.statistics.notes if "is not used" in note]
     assert (len(notes), len(refusals)) == ((0, 1) if is_damaged else (1, 0))

@@ -144,11 +144,11 @@ def test_the_parts_of_a_recording_join_to_its_map(tmp_path: Path) -> None:
 
 def test_vertices_of_a_mission_that_was_given_up_are_missing(tmp_path: Path) -> None:
     writer = submap_sources.SubmapWriter(SubmapOutput(submap_spool=tmp_path / "spool"))
-    builder = SimpleNamespace(missions=1, count=lambda mission: 5)
+    builder = SimpleNamespace(missions=[range(5)])
     update = SimpleNamespace(state=object(), time_ns=0)
     writer.after_frame(update, SimpleNamespace(builder=builder))  # type: ignore[arg-type]
     assert writer.is_whole
-    builder.missions = 2
+    builder.missions.append(range(5))
     writer.after_frame(update, SimpleNamespace(builder=builder))  # type: ignore[arg-type]
     assert not writer.is_whole
 
@@ -167,7 +167,7 @@ def test_what_was_pushed_leaves_the_memory(tmp_path: Path) -> None:
         mapping.run()
         writer.finish(mapping)
         assert mapping.builder is not None
-        left.append(mapping.builder.count(0))
+        left.append(len(mapping.builder.missions[0]))
         folders = find_maps(spool / "incoming" / "robot")
         parts.append([load_map(folder)[0].vertices for folder in folders])
     whole, rest = parts
