@@ -6,6 +6,7 @@ freedom (MSAC with local optimisation: Torr and Zisserman 2000, Chum et al. 2003
 """
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 
@@ -38,7 +39,6 @@ class PoseSolutions:
     inlier_count: I64  # (P,) inlier keypoints
     keypoint_count: I64  # (P,) keypoints that had a match
     is_inlier: NDArray[np.bool_]  # (N,) one match at most per keypoint
-    rms: F64  # (P,) error of the inliers in units of the tolerance
     covariance: F64  # (P, 6, 6) of [dp, dtheta] in the convention of `se3`, NaN where undetermined
     tilt_rad: F64  # (P,) angle between the given and the estimated gravity
 
@@ -64,14 +64,13 @@ def solve_poses(
     solved = search_level(
         LevelProblems(
             start=problems.start,
-            key=problems.key,
+            seed=mixed_seeds(problems.key, seed),
             origin_W=so3.rotate(q_W_I[of_match], problems.origin_I),
             ray_W=so3.rotate(q_W_I[of_match], problems.ray_I),
             point_M=np.ascontiguousarray(problems.point_M),
             keypoint=problems.keypoint,
-            tolerance=problems.tolerance,
+            inverse_sigma=1.0 / problems.tolerance,
         ),
-        seed=seed,
         max_iterations=max_iterations,
         tilt_sigma_rad=tilt_sigma_rad,
     )
@@ -80,40 +79,36 @@ def solve_poses(
         problems.keypoint[1:] != problems.keypoint[:-1]
     )
     keypoints = np.bincount(of_match[is_first], minlength=count)
-    inlier_cost = np.maximum(solved.cost - (keypoints - solved.inlier_count), 0.0)
     return PoseSolutions(
         T_M_I=solved.poses(q_W_I),
         inlier_count=solved.inlier_count,
         keypoint_count=keypoints,
         is_inlier=solved.is_inlier,
-        rms=np.sqrt(inlier_cost / np.maximum(solved.inlier_count, 1)),
         covariance=solved.covariances(q_W_I),
         tilt_rad=solved.tilt_rad,
     )
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class LevelProblems:
-    """PoseProblems with query data rotated to W, the level frame at the body."""
+class LevelProblems(NamedTuple):
+    """PoseProblems with query data rotated to W, the level frame at the body, as kernels take them."""
 
     start: I64  # (P + 1,)
-    key: I64  # (P,)
+    seed: NDArray[np.uint64]  # (P,) see `mixed_seeds`
     origin_W: F64  # (N, 3)
     ray_W: F64  # (N, 3)
     point_M: F64  # (N, 3)
     keypoint: I64  # (N,)
-    tolerance: F64  # (N,)
+    inverse_sigma: F64  # (N,) 1 / tolerance
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class LevelSolutions:
-    """Estimated poses T_M_W; expensive derived quantities are computed on request."""
+class LevelSolutions(NamedTuple):
+    """Estimated poses T_M_W, filled in by kernels; expensive quantities are computed on request."""
 
     R_M_W: F64  # (P, 3, 3)
     p_M_W: F64  # (P, 3)
     information: F64  # (P, 6, 6) of [dp, dtheta_W]
     cost: F64  # (P,)
-    inlier_count: I64  # (P,)
+    inlier_count: I64  # (P,) inlying keypoints
     is_inlier: NDArray[np.bool_]  # (N,)
 
     @property
@@ -132,26 +127,13 @@ class LevelSolutions:
 
 
 def search_level(
-    problems: LevelProblems,
-    *,
-    seed: int = 0,
-    max_iterations: int = 200,
-    tilt_sigma_rad: float = 0.02,
+    problems: LevelProblems, *, max_iterations: int = 200, tilt_sigma_rad: float = 0.02
 ) -> LevelSolutions:
     """Estimate poses as `solve_poses` does, for queries already rotated to W."""
     from maplab_py.vision import pose_kernels
 
-    count = len(problems.key)
-    matches = pose_kernels.MatchColumns(
-        problems.start,
-        _mixed_seeds(problems.key, seed),
-        problems.origin_W,
-        problems.ray_W,
-        problems.point_M,
-        problems.keypoint,
-        1.0 / problems.tolerance,
-    )
-    poses = pose_kernels.PoseColumns(
+    count = len(problems.seed)
+    poses = LevelSolutions(
         R_M_W=np.tile(np.eye(3), (count, 1, 1)),
         p_M_W=np.zeros((count, 3)),
         information=np.empty((count, 6, 6)),
@@ -159,10 +141,9 @@ def search_level(
         inlier_count=np.empty(count, dtype=np.int64),
         is_inlier=np.zeros(len(problems.keypoint), dtype=np.bool_),
     )
-    pose_kernels.search_poses(
-        matches, pose_kernels.SearchSettings(max_iterations, 1.0 / tilt_sigma_rad), poses
-    )
-    return LevelSolutions(*poses)
+    settings = pose_kernels.SearchSettings(max_iterations, 1.0 / tilt_sigma_rad)
+    pose_kernels.search_poses(problems, settings, poses)
+    return poses
 
 
 def _covariances(H: F64, q_W_I: F64) -> F64:
@@ -181,8 +162,8 @@ def _covariances(H: F64, q_W_I: F64) -> F64:
     return np.asarray(covariance)
 
 
-def _mixed_seeds(key: I64, seed: int) -> NDArray[np.uint64]:
-    """Return one well-mixed random state per problem (splitmix64's finaliser)."""
+def mixed_seeds(key: I64, seed: int) -> NDArray[np.uint64]:
+    """Return a well-mixed random state for each problem's key (P,), by splitmix64's finaliser."""
     with np.errstate(over="ignore"):
         z = key.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(seed % 2**63)
         z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)

@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64, U64, Mask
 from maplab_py.compilation import compiled, prange
 from maplab_py.vision.random_numbers import random_below
 
@@ -19,34 +18,11 @@ _LOOSE = 3.0
 """Hypotheses are scored with as many times the tolerance: their tilt is only as good as given."""
 
 
-class MatchColumns(NamedTuple):
-    """Matches of all problems, sorted by problem and keypoint, see `absolute_pose.LevelProblems`."""
-
-    start: I64  # (P + 1,)
-    seed: U64  # (P,)
-    origin_W: F64  # (N, 3)
-    ray_W: F64  # (N, 3)
-    point_M: F64  # (N, 3)
-    keypoint: I64  # (N,)
-    inverse_sigma: F64  # (N,) 1 / tolerance
-
-
 class SearchSettings(NamedTuple):
     """Length of the search, and uncertainty of gravity."""
 
     max_iterations: int
     inverse_tilt: float  # 1 / standard deviation [1/rad] of the given roll and pitch
-
-
-class PoseColumns(NamedTuple):
-    """Results of the search, filled in."""
-
-    R_M_W: F64  # (P, 3, 3)
-    p_M_W: F64  # (P, 3)
-    information: F64  # (P, 6, 6)
-    cost: F64  # (P,)
-    inlier_count: I64  # (P,) inlying keypoints
-    is_inlier: Mask  # (N,)
 
 
 @compiled()
@@ -364,6 +340,12 @@ def _search_pose(i, matches, settings, poses):  # type: ignore[no-untyped-def]
 
 @compiled(parallel=True)
 def search_poses(matches, settings, poses):  # type: ignore[no-untyped-def]
-    """Search the pose of every problem."""
+    """Search the pose of every problem.
+
+    Args:
+        matches: `absolute_pose.LevelProblems`, sorted by problem and keypoint.
+        settings: SearchSettings.
+        poses: `absolute_pose.LevelSolutions`, filled in.
+    """
     for problem in prange(len(matches.start) - 1):
         _search_pose(np.int64(problem), matches, settings, poses)

@@ -281,7 +281,6 @@ def _solutions(vi_map: VIMap, scans: Scans, matches: CloudMatches) -> PoseSoluti
         inlier_count=matches.agreeing,
         keypoint_count=matches.compared,
         is_inlier=np.zeros(0, dtype=np.bool_),
-        rms=matches.residual_m,
         covariance=_covariance(matches.information, T_I_Q, T_M_I),
         tilt_rad=np.arccos(np.clip(cosine, -1.0, 1.0)),
     )

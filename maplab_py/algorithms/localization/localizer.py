@@ -17,7 +17,7 @@ from maplab_py.algorithms.localization.options import LocalizationOptions
 from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.geometry import so3
 from maplab_py.vimap.table import ragged_rows
-from maplab_py.vision.absolute_pose import LevelProblems, LevelSolutions, search_level
+from maplab_py.vision.absolute_pose import LevelProblems, LevelSolutions, mixed_seeds, search_level
 from maplab_py.vision.index import DescriptorSet, InvertedMultiIndex, MatchRule
 
 _CERTAIN = 2
@@ -213,14 +213,14 @@ class Localizer:
         solutions = search_level(
             LevelProblems(
                 start=np.array([0, len(keypoint)]),
-                key=np.array([key]),
+                seed=mixed_seeds(np.array([key]), self._options.seed),
                 origin_W=level.origin_W[keypoint],
                 ray_W=level.ray_W[keypoint],
                 point_M=self._map.p_G[landmark],
                 keypoint=keypoint,
-                tolerance=self._options.ransac_pixel_sigma * level.query.rad_per_px[keypoint],
+                inverse_sigma=1.0
+                / (self._options.ransac_pixel_sigma * level.query.rad_per_px[keypoint]),
             ),
-            seed=self._options.seed,
             max_iterations=self._options.num_ransac_iters,
         )
         agreeing = np.flatnonzero(solutions.is_inlier)

@@ -58,7 +58,6 @@ def solutions(vi_map: VIMap, query: np.ndarray, *, off_m: np.ndarray) -> PoseSol
         np.full(count, 40),
         np.full(count, 60),
         np.ones(0, dtype=bool),
-        np.full(count, 0.5),
         np.tile(np.diag([1e-4] * 3 + [1e-6] * 3), (count, 1, 1)),
         np.zeros(count),
     )
