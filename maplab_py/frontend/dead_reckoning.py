@@ -47,9 +47,7 @@ class Tie:
             times_ns: Times (S,) of the samples.
             samples: As measured.
         """
-        data = inertial_data.InertialData(
-            np.array([0, len(times_ns)]), times_ns, samples, (imu,), np.zeros(1, dtype=np.int64)
-        )
+        data = inertial_data.InertialData.of_samples(imu, [(times_ns, samples)])
         edge = preintegration.integrate(data, last.gyro_bias, last.accel_bias)
         t = float(edge.duration_s[0])
         R_I_M = so3.to_matrix(last.T_M_I[0, :4]).T

@@ -1,6 +1,7 @@
 """IMU samples that wait for images: cut and interpolated at the times of frames."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -116,3 +117,14 @@ class ImuBuffer:
         share = (query_ns - times_ns[left]) / (times_ns[right] - times_ns[left])
         low, high = self._accel_gyro[left], self._accel_gyro[right]
         return np.asarray(low + share[:, None] * (high - low))
+
+
+def joined_samples(parts: Sequence[tuple[I64, F64]]) -> tuple[I64, F64]:
+    """Join times (S,) and samples (S, 6) of pieces that begin with the last sample of the one before."""
+    if not parts:
+        return np.zeros(0, dtype=np.int64), np.zeros((0, 6))
+    times_ns, samples = zip(*parts, strict=True)
+    return (
+        np.concatenate([times_ns[0], *(later[1:] for later in times_ns[1:])]),
+        np.concatenate([samples[0], *(later[1:] for later in samples[1:])]),
+    )

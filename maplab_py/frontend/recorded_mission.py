@@ -11,6 +11,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64, U8
 from maplab_py.frontend import backfill, dead_reckoning
+from maplab_py.frontend.imu_buffer import joined_samples
 from maplab_py.interop.recordings.protocol import RecordedSensors, TrackedFrame
 from maplab_py.sensors import Imu
 from maplab_py.storage.resources.new import NewResources
@@ -170,16 +171,6 @@ def merged_samples(parts: list[tuple[I64, F64]]) -> tuple[I64, F64]:
     times_ns, samples = joined_samples(parts)
     times_ns, rows = np.unique(times_ns, return_index=True)
     return times_ns, samples[rows]
-
-
-def joined_samples(parts: list[tuple[I64, F64]]) -> tuple[I64, F64]:
-    """Join pieces whose first sample repeats the last of the piece before."""
-    first = [slice(None), *([slice(1, None)] * (len(parts) - 1))]
-    if not parts:
-        return np.zeros(0, dtype=np.int64), np.zeros((0, 6))
-    times = [part[0][rows] for part, rows in zip(parts, first, strict=True)]
-    samples = [part[1][rows] for part, rows in zip(parts, first, strict=True)]
-    return np.concatenate(times), np.concatenate(samples)
 
 
 def mission_map(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
@@ -73,6 +74,23 @@ class InertialData:
             imus=tuple(vi_map.sensors.imu(to_hex(sensor_id)) for sensor_id in ids),
             imu_of_edge=np.asarray(imu_of_edge, dtype=np.int64).reshape(-1),
             edge_id=table.id[rows],
+        )
+
+    @classmethod
+    def of_samples(cls, imu: Imu, edges: Sequence[tuple[I64, F64]]) -> InertialData:
+        """Take times (S,) and samples (S, 6) of each of some edges of an IMU.
+
+        Raises:
+            MapError: The samples are bad.
+        """
+        none = np.zeros(0, dtype=np.int64), np.zeros((0, 6))
+        times_ns, samples = (np.concatenate(c) for c in zip(none, *edges, strict=True))
+        return cls(
+            sample_start=starts_of_counts(np.array([len(t) for t, _ in edges], dtype=np.int64)),
+            timestamp_ns=times_ns,
+            accel_gyro=samples,
+            imus=(imu,),
+            imu_of_edge=np.zeros(len(edges), dtype=np.int64),
         )
 
     def __len__(self) -> int:

@@ -101,13 +101,8 @@ def integrate(
 
 def compile_kernels() -> None:
     """Compile the integration on one edge of three samples."""
-    data = InertialData(
-        sample_start=np.array([0, 3], dtype=np.int64),
-        timestamp_ns=np.array([0, 5_000_000, 10_000_000], dtype=np.int64),
-        accel_gyro=np.tile([0.0, 0.0, 9.81, 0.0, 0.0, 0.1], (3, 1)),
-        imus=(Imu(id="0" * 32),),
-        imu_of_edge=np.zeros(1, dtype=np.int64),
-    )
+    samples = np.tile([0.0, 0.0, 9.81, 0.0, 0.0, 0.1], (3, 1))
+    data = InertialData.of_samples(Imu(id="0" * 32), [(5_000_000 * np.arange(3), samples)])
     for with_intrinsics in (False, True):
         integrate(data, np.zeros(3), np.zeros(3), with_intrinsics=with_intrinsics)
 

@@ -14,10 +14,10 @@ from maplab_py.array_types import F64, I32, I64, Mask
 from maplab_py.estimation.imu.inertial_data import InertialData
 from maplab_py.estimation.imu.preintegration import Preintegrated, integrate
 from maplab_py.estimation.window.frame import ImuPart
+from maplab_py.frontend.imu_buffer import joined_samples
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.device import RecordedSensors
 from maplab_py.sensors import Imu
-from maplab_py.vimap.table import starts_of_counts
 from maplab_py.vision.tracking.ray_table import RayTable
 
 SPAN_NS, _STEP_NS = 500_000_000, 250_000_000
@@ -175,16 +175,8 @@ class MotionComparison:
 
     def _integrated(self, legs: list[list[Sighting]], biases: tuple[F64, F64]) -> Preintegrated:
         """Integrate the samples of two legs."""
-        times = [np.concatenate([f.times_ns[i > 0 :] for i, f in enumerate(leg)]) for leg in legs]
-        samples = [
-            np.concatenate([f.accel_gyro[i > 0 :] for i, f in enumerate(leg)]) for leg in legs
-        ]
-        data = InertialData(
-            sample_start=starts_of_counts(np.array([len(t) for t in times])),
-            timestamp_ns=np.concatenate(times), accel_gyro=np.concatenate(samples),
-            imus=(self._imu,), imu_of_edge=np.zeros(2, dtype=np.int64),
-        )  # fmt: skip
-        return integrate(data, *biases)
+        edges = [joined_samples([(f.times_ns, f.accel_gyro) for f in leg]) for leg in legs]
+        return integrate(InertialData.of_samples(self._imu, edges), *biases)
 
 
 def _compare(T_M_I: F64, legs: Preintegrated, imu: Imu) -> tuple[F64, F64]:

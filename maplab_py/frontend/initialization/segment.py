@@ -10,8 +10,8 @@ import numpy as np
 from maplab_py.array_types import F64, I32, I64
 from maplab_py.estimation.imu.inertial_data import InertialData
 from maplab_py.estimation.window.frame import WindowFrame
+from maplab_py.frontend.imu_buffer import joined_samples
 from maplab_py.sensors import Imu
-from maplab_py.vimap.table import starts_of_counts
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -103,10 +103,7 @@ class History:
 
     def samples(self, duration_s: float) -> tuple[I64, F64]:
         """Return the IMU samples (S,), (S, 6) between the frames of the last so many seconds."""
-        frames = self.latest(duration_s)[1:]
-        if not frames:
-            return np.zeros(0, dtype=np.int64), np.zeros((0, 6))
-        return _joined(frames)
+        return _joined(self.latest(duration_s)[1:])
 
     def segment(self, imu: Imu, interval_s: float) -> Segment:
         """Return frames about so far apart, the newest among them, and all samples between them."""
@@ -118,14 +115,6 @@ class History:
                 chosen.append(row)
         chosen.reverse()
         edges = [_joined(frames[a + 1 : b + 1]) for a, b in itertools.pairwise(chosen)]
-        none = (np.zeros(0, dtype=np.int64), np.zeros((0, 6)))
-        inertial = InertialData(
-            sample_start=starts_of_counts(np.array([len(t) for t, _ in edges], dtype=np.int64)),
-            timestamp_ns=np.concatenate([t for t, _ in [none, *edges]]),
-            accel_gyro=np.concatenate([values for _, values in [none, *edges]]),
-            imus=(imu,),
-            imu_of_edge=np.zeros(len(edges), dtype=np.int64),
-        )
         is_chosen = np.zeros(len(frames), dtype=np.bool_)
         is_chosen[chosen] = True
         others = np.flatnonzero(~is_chosen[chosen[0] :]) + chosen[0]
@@ -133,12 +122,10 @@ class History:
         between = ObservedFrames.of([frames[row] for row in others.tolist()])
         return Segment(
             kept.time_ns, kept.frame, kept.camera, kept.track_id, kept.uv_px, kept.sigma_px,
-            inertial, between,
+            InertialData.of_samples(imu, edges), between,
         )  # fmt: skip
 
 
 def _joined(frames: list[WindowFrame]) -> tuple[I64, F64]:
     """Return the samples on the way to consecutive frames; the common ones are kept once."""
-    times = [frames[0].imu_times_ns, *(frame.imu_times_ns[1:] for frame in frames[1:])]
-    values = [frames[0].accel_gyro, *(frame.accel_gyro[1:] for frame in frames[1:])]
-    return np.concatenate(times).astype(np.int64), np.concatenate(values).astype(np.float64)
+    return joined_samples([(frame.imu_times_ns, frame.accel_gyro) for frame in frames])
