@@ -14,7 +14,7 @@ from benchmarks.problems import (
 )
 from benchmarks.solution import Effort, Solution, StoppingRule, effort
 from maplab_py.estimation.codegen.kernels import residual_kernel, visual_kernels
-from maplab_py.estimation.imu import inertial_data, preintegration
+from maplab_py.estimation.imu import inertial_data
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.problem import gauge, iterative
 from maplab_py.estimation.problem.problem import Problem
@@ -142,10 +142,10 @@ def _inertial_data(problem: InertialProblem) -> inertial_data.InertialData:
 def _inertial_terms(data: inertial_data.InertialData, first: I64) -> list[FactorTerm]:
     kernel = residual_kernel("inertial", inertial)
     gravity = np.tile([0.0, 0.0, -GRAVITY_MPS2], (len(data), 1))
-    walk = preintegration.integrate(data, np.zeros(3), np.zeros(3))
+    walk = data.walk_variance_density[data.imu_of_edge] * data.duration_s[:, None]
     return [
         InertialTerm(kernel, data, first, first + 1, gravity),
-        BiasWalkTerm(first, first + 1, walk.gyro_walk_variance, walk.accel_walk_variance),
+        BiasWalkTerm(first, first + 1, walk[:, 0], walk[:, 1]),
     ]
 
 

@@ -243,7 +243,7 @@ def _content_of_function(kernel: Any, kernels: list[Any]) -> Iterator[str]:
             yield _describe(value)
             if isinstance(value, _Intrinsic) and hasattr(value, "straight_line"):
                 codes.append(value.straight_line.__code__)
-                yield repr(value.width)
+                yield repr(value.settings)
             if isinstance(value, Dispatcher) and value not in kernels:
                 kernels.append(value)
 

@@ -25,7 +25,7 @@ _INSTRUCTIONS = {ast.Add: "fadd", ast.Sub: "fsub", ast.Mult: "fmul", ast.Div: "f
 _COMPARISONS = {ast.Lt: "<", ast.LtE: "<=", ast.Eq: "==", ast.NotEq: "!="}
 
 
-def straight_line(function: Callable[..., None], width: int = 1) -> Any:
+def straight_line(function: Callable[..., None], width: int = 1, *, contracts: bool = True) -> Any:
     """Return what kernels call for a function of contiguous arrays of real numbers, and of numbers.
 
     Args:
@@ -35,6 +35,7 @@ def straight_line(function: Callable[..., None], width: int = 1) -> Any:
             statements.
         width: Length of the last axis of arrays that are indexed by one index less than they have axes,
             and number of arguments of `row`. Sums and products of rows, and of rows and numbers, are rows.
+        contracts: Whether a product and a sum may be one operation, which is rounded once.
     """
 
     if numba.config.DISABLE_JIT:
@@ -49,7 +50,7 @@ def straight_line(function: Callable[..., None], width: int = 1) -> Any:
             return None
 
         def lower(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-            lowering = _Lowering(context, builder, width)
+            lowering = _Lowering(context, builder, width, _CONTRACT if contracts else ())
             for name, kind, value in zip(names, signature.args, values, strict=True):
                 lowering.add_argument(name, kind, value)
             lowering.lower(function)
@@ -63,7 +64,7 @@ def straight_line(function: Callable[..., None], width: int = 1) -> Any:
         [inspect.Parameter(name, inspect.Parameter.POSITIONAL_ONLY) for name in ["_", *names]]
     )
     intrinsic = numba.extending.intrinsic(define)
-    intrinsic.straight_line, intrinsic.width = function, width
+    intrinsic.straight_line, intrinsic.settings = function, (width, contracts)
     return intrinsic
 
 
@@ -78,8 +79,8 @@ def row(*entries: float) -> F64:
 class _Lowering:
     """The values of names while the statements of a function become instructions."""
 
-    def __init__(self, context: Any, builder: Any, width: int) -> None:
-        self._context, self._builder = context, builder
+    def __init__(self, context: Any, builder: Any, width: int, flags: tuple[str, ...]) -> None:
+        self._context, self._builder, self._flags = context, builder, flags
         self._row = ir.VectorType(ir.DoubleType(), width)
         self._arrays: dict[str, tuple[Any, Any]] = {}  # type and value
         self._values: dict[str, Any] = {}
@@ -164,13 +165,13 @@ class _Lowering:
             case ast.Subscript():
                 return builder.load(self._place(node), align=_BYTES)
             case ast.UnaryOp(op=ast.USub()):
-                return builder.fneg(self._value(node.operand), flags=_CONTRACT)
+                return builder.fneg(self._value(node.operand), flags=self._flags)
             case ast.BinOp() if type(node.op) in _INSTRUCTIONS:
                 instruction = getattr(builder, _INSTRUCTIONS[type(node.op)])
                 left, right = self._value(node.left), self._value(node.right)
                 if left.type != right.type:
                     left, right = self._as_row(left), self._as_row(right)
-                return instruction(left, right, flags=_CONTRACT)
+                return instruction(left, right, flags=self._flags)
             case ast.IfExp(test=ast.Compare() as test):
                 condition = self._condition(test)
                 return builder.select(condition, self._value(node.body), self._value(node.orelse))

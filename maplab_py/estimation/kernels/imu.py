@@ -13,12 +13,14 @@ second. (Forster et al., On-Manifold Preintegration, TRO 2017, eq. (31) holds w 
 instead, which is of first order.)
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from maplab_py.array_types import F64, I64
 from maplab_py.compilation import compiled, prange
+from maplab_py.estimation.codegen.straight_line import straight_line
 from maplab_py.estimation.kernels import so3
 
 
@@ -70,7 +72,7 @@ def _edge(data: EdgeSamples, edge: int) -> _Edge:
     )
 
 
-@compiled()
+@compiled(forceinline=True)
 def _multiply(a: F64, b: F64, out: F64) -> None:
     """Compute out = a b for 3x3 matrices."""
     for i in range(3):
@@ -78,7 +80,7 @@ def _multiply(a: F64, b: F64, out: F64) -> None:
             out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
 
 
-@compiled()
+@compiled(forceinline=True)
 def _rotation(phi: F64, E: F64, J: F64) -> None:
     """Compute E = Exp(phi) and the right Jacobian J of phi (Forster eq. (3) and (8))."""
     x, y, z = phi[0], phi[1], phi[2]
@@ -103,7 +105,7 @@ def _rotation(phi: F64, E: F64, J: F64) -> None:
     _add_skew(J, x, y, z, -cosine)
 
 
-@compiled()
+@compiled(forceinline=True)
 def _add_skew(matrix: F64, x: float, y: float, z: float, factor: float) -> None:
     matrix[0, 1] -= factor * z
     matrix[0, 2] += factor * y
@@ -113,7 +115,7 @@ def _add_skew(matrix: F64, x: float, y: float, z: float, factor: float) -> None:
     matrix[2, 1] += factor * x
 
 
-@compiled()
+@compiled(forceinline=True)
 def _times_skew(a: F64, v: F64, out: F64) -> None:
     """Compute out = a skew(v)."""
     for i in range(3):
@@ -122,7 +124,7 @@ def _times_skew(a: F64, v: F64, out: F64) -> None:
         out[i, 2] = a[i, 0] * v[1] - a[i, 1] * v[0]
 
 
-@compiled()
+@compiled(forceinline=True)
 def _correct(C_a: F64, samples: F64, row: int, bias: F64, force: F64) -> None:
     """Compute the specific force of a sample, C_a (measured - bias)."""
     for i in range(3):
@@ -131,14 +133,14 @@ def _correct(C_a: F64, samples: F64, row: int, bias: F64, force: F64) -> None:
             force[i] += C_a[i, j] * (samples[row, j] - bias[j])
 
 
-@compiled()
+@compiled(forceinline=True)
 def _transpose(matrix: F64) -> None:
     for i in range(matrix.shape[0]):
         for j in range(i):
             matrix[i, j], matrix[j, i] = matrix[j, i], matrix[i, j]
 
 
-@compiled()
+@compiled(forceinline=True)
 def _mean_rotation(C_g: F64, samples: F64, row: int, bias: F64, dt: float, phi: F64) -> None:
     """Compute the rotation vector phi of the mean angular velocity of two samples during dt."""
     for i in range(3):
@@ -148,7 +150,7 @@ def _mean_rotation(C_g: F64, samples: F64, row: int, bias: F64, dt: float, phi: 
             phi[i] += dt * C_g[i, j] * (mean - bias[j])
 
 
-@compiled()
+@compiled(forceinline=True)
 def _advance(R_0: F64, R_1: F64, f_0: F64, f_1: F64, dt: float, v: F64, p: F64) -> None:
     """Add the motion under an evenly changing acceleration R_0 f_0 .. R_1 f_1 to p and v."""
     for i in range(3):
@@ -160,7 +162,7 @@ def _advance(R_0: F64, R_1: F64, f_0: F64, f_1: F64, dt: float, v: F64, p: F64) 
         v[i] += 0.5 * dt * (first + last)
 
 
-@compiled()
+@compiled(forceinline=True)
 def _acceleration_derivatives(
     R_0: F64,
     R_1: F64,
@@ -193,26 +195,31 @@ def _acceleration_derivatives(
                 by_accel[k, i, j] = (1.0 - w) * R_0[i, j] + w * R_1[i, j]
 
 
-@compiled()
 def _transition(state: F64, E: F64, M: F64, dt: float) -> None:
     """Multiply the rows of state (9, n), ordered p, theta, v, by the error transition F.
 
     F = [[I, M_b dt^2 / 2, I dt], [0, E^T, 0], [0, M_a dt, I]]; after Forster, appendix A, with the
     accelerations a and b, whose derivatives by theta are M (2, 3, 3).
     """
-    for col in range(state.shape[1]):
-        x, y, z = state[3, col], state[4, col], state[5, col]
-        for i in range(3):
-            a = M[0, i, 0] * x + M[0, i, 1] * y + M[0, i, 2] * z
-            b = M[1, i, 0] * x + M[1, i, 1] * y + M[1, i, 2] * z
-            state[i, col] += dt * (state[6 + i, col] + 0.5 * dt * b)
-            state[6 + i, col] += dt * a
-            state[3 + i, col] = E[0, i] * x + E[1, i] * y + E[2, i] * z
+    x = state[3]
+    y = state[4]
+    z = state[5]
+    for i in range(3):
+        a = M[0, i, 0] * x + M[0, i, 1] * y + M[0, i, 2] * z
+        b = M[1, i, 0] * x + M[1, i, 1] * y + M[1, i, 2] * z
+        state[i] = state[i] + dt * (state[6 + i] + 0.5 * dt * b)
+        state[6 + i] = state[6 + i] + dt * a
+        state[3 + i] = E[0, i] * x + E[1, i] * y + E[2, i] * z
 
 
-@compiled()
+_move_covariance = straight_line(_transition, width=12, contracts=False)
+_move_jacobian = straight_line(_transition, width=6, contracts=False)
+_move_whole_jacobian = straight_line(_transition, width=21, contracts=False)
+
+
+@compiled(forceinline=True)
 def _noise_gain(by_accel: F64, by_theta: F64, correction: F64, dt: float, gain: F64) -> None:
-    """Compute gain (9, 3): change of [p, theta, v] per unit of measured value during dt.
+    """Compute gain (3, 12): change of [p, theta, v] per unit of measured value during dt, and padding.
 
     Args:
         by_accel: Derivatives (2, 3, 3) of the accelerations a and b by the corrected value.
@@ -228,19 +235,21 @@ def _noise_gain(by_accel: F64, by_theta: F64, correction: F64, dt: float, gain: 
                 a += by_accel[0, i, k] * correction[k, j]
                 b += by_accel[1, i, k] * correction[k, j]
                 theta += by_theta[i, k] * correction[k, j]
-            gain[i, j] = 0.5 * dt * dt * b
-            gain[3 + i, j] = dt * theta
-            gain[6 + i, j] = dt * a
+            gain[j, i] = 0.5 * dt * dt * b
+            gain[j, 3 + i] = dt * theta
+            gain[j, 6 + i] = dt * a
 
 
-@compiled()
+@partial(straight_line, width=12, contracts=False)
 def _add_noise(covariance: F64, gain: F64, variance: float) -> None:
-    """Compute covariance += variance gain gain^T."""
+    """Compute covariance += variance gain^T gain; rows of 12, of which 9 are used."""
+    p = gain[0]
+    q = gain[1]
+    r = gain[2]
     for i in range(9):
-        for j in range(9):
-            covariance[i, j] += variance * (
-                gain[i, 0] * gain[j, 0] + gain[i, 1] * gain[j, 1] + gain[i, 2] * gain[j, 2]
-            )
+        covariance[i] = covariance[i] + variance * (
+            gain[0, i] * p + gain[1, i] * q + gain[2, i] * r
+        )
 
 
 @compiled()
@@ -276,7 +285,7 @@ def _add_intrinsics(
         i = k if k < 3 else (0 if k < 5 else 1)
         j = k if k < 3 else (1 if k == 3 else 2)
         for n in range(9):
-            D[n, 6 + k] -= gyro_gain[n, i] * w[j]
+            D[n, 6 + k] -= gyro_gain[i, n] * w[j]
         for n in range(3):
             first, last = A_0[n, i] * u_0[j], A_1[n, i] * u_1[j]
             D[n, 12 + k] -= dt * dt * (2.0 * first + last) / 6.0
@@ -298,7 +307,7 @@ def _preintegrate_edge(
     E, J, next_R = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     by_theta, by_gyro, by_accel = np.empty((2, 3, 3)), np.empty((2, 3, 3)), np.empty((2, 3, 3))
     zero = np.zeros((3, 3))
-    gyro_gain, accel_gain = np.empty((9, 3)), np.empty((9, 3))
+    gyro_gain, accel_gain, S = np.zeros((3, 12)), np.zeros((3, 12)), np.zeros((9, 12))
     phi, f_0, f_1 = np.empty(3), np.empty(3), np.empty(3)
     for i in range(3):
         R[i, i] = 1.0
@@ -314,16 +323,19 @@ def _preintegrate_edge(
         _acceleration_derivatives(R, next_R, f_0, f_1, E, J, dt, by_theta, by_gyro, by_accel)
         _noise_gain(by_gyro, J, C_g, dt, gyro_gain)
         _noise_gain(by_accel, zero, C_a, dt, accel_gain)
-        _transition(P, E, by_theta, dt)  # F P
-        _transpose(P)
-        _transition(P, E, by_theta, dt)  # F (F P)^T
-        _add_noise(P, gyro_gain, noise[0] / dt)
-        _add_noise(P, accel_gain, noise[1] / dt)
-        _transition(D, E, by_theta, dt)
+        _move_covariance(S, E, by_theta, dt)  # F P
+        _transpose(S)
+        _move_covariance(S, E, by_theta, dt)  # F (F P)^T
+        _add_noise(S, gyro_gain, noise[0] / dt)
+        _add_noise(S, accel_gain, noise[1] / dt)
+        if D.shape[1] > 6:
+            _move_whole_jacobian(D, E, by_theta, dt)
+        else:
+            _move_jacobian(D, E, by_theta, dt)
         for i in range(9):
             for j in range(3):
-                D[i, j] -= gyro_gain[i, j]
-                D[i, 3 + j] -= accel_gain[i, j]
+                D[i, j] -= gyro_gain[j, i]
+                D[i, 3 + j] -= accel_gain[j, i]
         if D.shape[1] > 6:
             _add_intrinsics(edge, row, R_A_I, (R, next_R, f_0, f_1), gyro_gain, dt, D)
         _advance(R, next_R, f_0, f_1, dt, v, p)
@@ -332,8 +344,9 @@ def _preintegrate_edge(
                 R[i, j] = next_R[i, j]
     for i in range(9):
         for j in range(i):
-            P[i, j] = 0.5 * (P[i, j] + P[j, i])
+            P[i, j] = 0.5 * (S[i, j] + S[j, i])
             P[j, i] = P[i, j]
+        P[i, i] = S[i, i]
 
 
 @compiled()

@@ -157,12 +157,13 @@ def _scatter(
             while runs[run + 1, 0] <= j:
                 run += 1
         col = cols[j // d] * d + j % d
-        source = update.values[j * update.leading : j * update.leading + len(rows) * d]
-        panel = target.values[col * target.leading : (col + 1) * target.leading]
+        source, panel = j * update.leading, col * target.leading
         for other in range(run, count):
-            shift = runs[other, 1] - runs[other, 0]
-            for i in range(max(first, runs[other, 0]), runs[other + 1, 0]):
-                panel[i + shift] -= source[i]
+            begin, end = max(first, runs[other, 0]), runs[other + 1, 0]
+            place = panel + begin + runs[other, 1] - runs[other, 0]
+            part = target.values[place : place + end - begin]
+            for i, value in enumerate(update.values[source + begin : source + end]):
+                part[i] -= value
 
 
 @compiled()
