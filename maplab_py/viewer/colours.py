@@ -1,7 +1,6 @@
 """Colours for dark and light backgrounds: (..., 3) of uint8."""
 
 import colorsys
-from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -91,9 +90,9 @@ def normalised(values: F64, period: float = 0.0, offset: float = 0.0) -> tuple[F
     return (values - low) / max(high - low, 1e-12), low, high
 
 
-def hex_codes(colours: U8) -> Sequence[str]:
+def hex_codes(colours: U8) -> tuple[str, ...]:
     """Return the codes of colours (N, 3)."""
-    return [to_hex(colour) for colour in colours]
+    return tuple(to_hex(colour) for colour in colours)
 
 
 def linear_light(colours: U8) -> F64:

@@ -121,6 +121,31 @@ class Drawing:
         groups = np.split(order, cuts) if len(order) else []
         return [(self.mission_ids[int(mission[places[0]])], places) for places in groups]
 
+    def points(
+        self, mission: NDArray[Any], p: F64, colour: U8, rows: I64, size_m: float
+    ) -> dict[str, Points]:
+        """Return points (N, 3) in a colour each (N, 3) by the missions (N,) that they are of."""
+        return {
+            mission_id: make_points(p[places], colour[places], rows[places], size_m)
+            for mission_id, places in self.by_mission(mission)
+        }
+
+    def segments(
+        self,
+        mission: NDArray[Any],
+        start: F64,
+        end: F64,
+        colour: U8,
+        rows: I64,
+        width_px: float,
+    ) -> dict[str, Segments]:
+        """Return lines (N,) in one colour (3,) or one each (N, 3) by the missions that they are of."""
+        every = np.broadcast_to(colour, start.shape)
+        return {
+            mission_id: make_segments(start[k], end[k], every[k], rows[k], width_px)
+            for mission_id, k in self.by_mission(mission)
+        }
+
 
 def mission_shift(vi_map: VIMap, options: VisualizationOptions) -> F64:
     """Return by how much each mission (M, 3) is drawn away from where it is [m]."""

@@ -73,7 +73,7 @@ def coloured_mesh(
 
 
 def _ramp(mesh: Cloud, part: F64, stops: U8, text: str, low: str, high: str) -> Cloud:
-    legend = scene.LegendEntry(text, tuple(colours.hex_codes(stops)), low, high)
+    legend = scene.LegendEntry.ramp(text, stops, low, high)
     return dataclasses.replace(mesh, colours=colours.ramp(part, stops), legend=(legend,))
 
 
@@ -120,7 +120,5 @@ def field_slice(
     near, far = float(distance_m[rows].min()), float(distance_m[rows].max())
     part = (distance_m[rows] - near) / max(far - near, 1e-9)
     stops = colours.SEQUENTIAL[::-1]
-    legend = scene.LegendEntry(
-        "distance", tuple(colours.hex_codes(stops)), f"{near:.3g} m", f"{far:.3g} m"
-    )
+    legend = scene.LegendEntry.ramp("distance", stops, f"{near:.3g} m", f"{far:.3g} m")
     return Cloud("Distance field", p_G[rows], colours.ramp(part, stops), legend=(legend,))

@@ -7,11 +7,13 @@ the map is far from the origin of G, so that nothing is lost to rounding.
 import dataclasses
 from collections.abc import Mapping
 from enum import Enum
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.array_types import F32, F64, I64, U8
+from maplab_py.viewer import colours as palettes
 
 WHOLE_MAP = ""
 """Key of parts that belong to no single mission."""
@@ -90,6 +92,11 @@ class LegendEntry:
     colours: tuple[str, ...]  # one code = swatch, several = ramp
     low: str = ""
     high: str = ""
+
+    @classmethod
+    def ramp(cls, text: str, stops: U8, low: str, high: str) -> Self:
+        """Return a ramp of colours (n, 3) between two labels."""
+        return cls(text, palettes.hex_codes(stops), low, high)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

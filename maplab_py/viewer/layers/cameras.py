@@ -10,7 +10,7 @@ from maplab_py.geometry import se3
 from maplab_py.sensors import Camera, CameraRig, SensorSet, projection
 from maplab_py.viewer import colours
 from maplab_py.viewer.drawing import Drawing, make_segments, omission_notes
-from maplab_py.viewer.scene import Axes, Layer, Part
+from maplab_py.viewer.scene import WHOLE_MAP, Axes, Layer, Part
 from maplab_py.vimap import MissionSensor, VIMap, mission_sensor_id
 
 _FRUSTA_PER_MISSION = 250
@@ -125,18 +125,9 @@ def landmark_observers(drawing: Drawing, landmarks: I64, limit: int) -> Layer:
     landmark = vi_map.keypoints.landmark[keypoints].astype(np.int64)
     centres, vertices = camera_centres(drawing, keypoints)
     mission = vi_map.vertices.mission[vertices]
-    parts: dict[str, Part] = {}
-    for mission_id, members in drawing.by_mission(mission):
-        colour = colours.mixed(
-            drawing.mission_colours[mission[members[0]]], colours.REFERENCE, 0.55
-        )
-        parts[mission_id] = make_segments(
-            centres[members],
-            drawing.p_landmarks[landmark[members]],
-            colour,
-            landmark[members],
-            0.75,
-        )
+    pale = colours.mixed(drawing.mission_colours, colours.REFERENCE, 0.55)[mission]
+    ends = centres, drawing.p_landmarks[landmark]
+    parts = drawing.segments(mission, *ends, pale, landmark, 0.75)
     total, title = int(counts[landmarks].sum()), "Landmark observers"
     drawn = sum(len(part) for part in parts.values())
     notes = omission_notes(title, drawn, (total - drawn, f"as at most {limit:,} rays are drawn"))
@@ -158,5 +149,5 @@ def sensor_axes(sensors: SensorSet) -> Layer:
         poses.append(T_B_S)
     T = np.array(poses).reshape(-1, 7)
     reach = float(np.abs(T[:, 4:]).max()) if len(T) else 0.0
-    parts: dict[str, Part] = {"": Axes(T, max(0.35 * reach, 0.03), tuple(labels))}
-    return Layer("sensors", "Sensors", parts, len(T))
+    axes = Axes(T, max(0.35 * reach, 0.03), tuple(labels))
+    return Layer("sensors", "Sensors", {WHOLE_MAP: axes}, len(T))

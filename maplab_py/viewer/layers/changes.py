@@ -12,7 +12,7 @@ from maplab_py.array_types import U8, U64
 from maplab_py.viewer import colours
 from maplab_py.viewer.drawing import Drawing, ImageOf, make_points, make_segments
 from maplab_py.viewer.layers.clouds import Cloud
-from maplab_py.viewer.scene import WHOLE_MAP, Entity, Layer, Part
+from maplab_py.viewer.scene import WHOLE_MAP, Entity, Layer
 from maplab_py.vimap import VIMap, from_hex
 
 _COLOURS = {"vanished": "#d2455a", "appeared": "#3fa372", "moved": "#e09b2d"}
@@ -49,10 +49,9 @@ def change_layers(drawing: Drawing, changes: Sequence[Change]) -> list[Layer]:
     tints = np.concatenate([colours.from_hex(_COLOURS[c.change]) for c in changes])
     dots = make_points(tops[named], tints[named], before[named], 0.012 * drawing.unit_m)
     labels = [f"{changes[row].change} by {changes[row].until}" for row in named.tolist()]
-    names: dict[str, Part] = {WHOLE_MAP: dataclasses.replace(dots, labels=tuple(labels))}
-    lines_of: dict[str, Part] = {WHOLE_MAP: boxes}
+    names = {WHOLE_MAP: dataclasses.replace(dots, labels=tuple(labels))}
     return [
-        Layer("changes", "Changes", lines_of, len(changes)),
+        Layer("changes", "Changes", {WHOLE_MAP: boxes}, len(changes)),
         Layer("change_names", "Dates of changes", names, len(named), Entity.VERTEX),
     ]
 

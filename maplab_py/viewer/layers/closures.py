@@ -31,7 +31,7 @@ def recorded_closures(drawing: Drawing) -> tuple[list[Layer], list[str]]:
     if not len(record):
         return [], []
     is_accepted = record.verdict == VERDICTS.index(Verdict.ACCEPTED)
-    legend = LegendEntry("weight", tuple(colours.hex_codes(colours.TRUST)), "0", "1")
+    legend = LegendEntry.ramp("weight", colours.TRUST, "0", "1")
     colour = colours.ramp(record.weight, colours.TRUST)
     ends = [drawing.p_vertices[rows] for rows in closure_ends(drawing, record)]
 

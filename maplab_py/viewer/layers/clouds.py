@@ -69,7 +69,7 @@ def mesh_layer(drawing: Drawing, cloud: Cloud, number: int) -> Layer:
     colour = cloud.colours
     if colour is None:
         colour = np.median(cloud_colours(cloud), axis=0).astype(np.uint8)
-    parts: dict[str, Part] = {cloud.mission_id: Mesh(p, faces, colour)}
+    parts = {cloud.mission_id: Mesh(p, faces, colour)}
     swatch = () if colour.ndim == 2 else (LegendEntry(cloud.title, (colours.to_hex(colour),)),)
     return Layer(f"mesh_{number}", cloud.title, parts, len(faces), legend=cloud.legend or swatch)
 
@@ -99,13 +99,10 @@ def colour_ranges(clouds: tuple[Cloud, ...]) -> ColourRanges:
 
 def range_legend(title: str, ranges: ColourRanges) -> tuple[LegendEntry, ...]:
     """Return the ramps of clouds that are coloured by a value."""
-    codes = tuple(colours.hex_codes(colours.SEQUENTIAL))
-    units = {"height": " m", "intensity": ""}
+    units, stops = {"height": " m", "intensity": ""}, colours.SEQUENTIAL
     return tuple(
-        LegendEntry(
-            f"{title}: {what}", codes, f"{low:.4g}{units[what]}", f"{high:.4g}{units[what]}"
-        )
-        for what, (low, high) in ranges.items()
+        LegendEntry.ramp(f"{title}: {what}", stops, *(f"{end:.4g}{units[what]}" for end in ends))
+        for what, ends in ranges.items()
     )
 
 

@@ -64,16 +64,20 @@ def beside(drawing: Drawing, other: VIMap, names: tuple[str, str]) -> list[Layer
     """
     shift = shift_beside(drawing, other)
     colour = mission_colours_of(drawing, other)
-    p = other.T_G_I[:, 4:] + shift
-    mission = other.vertices.mission
-    start = np.flatnonzero(mission[1:] == mission[:-1])
-    path = make_segments(p[start], p[start + 1], colour[mission[start]], start, 3.0)
-    lines: dict[str, Part] = {WHOLE_MAP: path}
     return [
-        Layer("reference_trajectories", "Reference paths", lines, len(other.missions)),
+        reference_paths(other, shift, colour, 3.0),
         reference_landmarks(drawing, other, shift, colour, is_visible=True),
-        _names(drawing, p, names),
+        _names(drawing, other.T_G_I[:, 4:] + shift, names),
     ]
+
+
+def reference_paths(other: VIMap, shift: F64, colour: U8, width_px: float) -> Layer:
+    """Return the paths of the other map; see `reference_landmarks`."""
+    p, mission = other.T_G_I[:, 4:] + shift, other.vertices.mission
+    start = np.flatnonzero(mission[1:] == mission[:-1])
+    each = colour if colour.ndim == 1 else colour[mission[start]]
+    lines = {WHOLE_MAP: make_segments(p[start], p[start + 1], each, start, width_px)}
+    return Layer("reference_trajectories", "Reference paths", lines, len(other.missions))
 
 
 def reference_landmarks(
@@ -149,5 +153,4 @@ def _names(drawing: Drawing, p_other: F64, names: tuple[str, str]) -> Layer:
     top = np.array([0.0, 0.0, 0.45 * drawing.extent.radius_m])
     size = 0.002 * drawing.unit_m
     dots = make_points(np.array(middles) + top, colours.REFERENCE, np.arange(2), size)
-    parts: dict[str, Part] = {WHOLE_MAP: dataclasses.replace(dots, labels=names)}
-    return Layer("names", "Names", parts, 2)
+    return Layer("names", "Names", {WHOLE_MAP: dataclasses.replace(dots, labels=names)}, 2)

@@ -39,7 +39,7 @@ def loop_closure_covariances(drawing: Drawing) -> Layer:
     covariance = R_G_A @ edges.covariance[rows, :3, :3] @ np.swapaxes(R_G_A, 1, 2)
     colour = colours.ramp(edges.switch_variable[rows], colours.TRUST)
     scale = drawing.options.covariance_scale
-    parts: dict[str, Part] = {WHOLE_MAP: ellipsoids(centre, covariance, colour, rows, scale)}
+    parts = {WHOLE_MAP: ellipsoids(centre, covariance, colour, rows, scale)}
     return Layer(LOOP_CLOSURES, title, parts, len(usable), Entity.LOOP_CLOSURE)
 
 

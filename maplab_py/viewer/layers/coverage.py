@@ -71,9 +71,8 @@ def uncertainty_tubes(drawing: Drawing) -> Layer:
                 rings.reshape(-1, 3).astype(np.float32), _faces(len(rows)),
                 np.repeat(colour[rows], _CORNERS, axis=0), opacity=_TUBE_OPACITY,
             )  # fmt: skip
-    codes = tuple(colours.hex_codes(colours.HEAT))
     title = f"uncertainty of the path, {scale:g} sigma"
-    legend = LegendEntry(title, codes, "0 m", f"{scale * largest:.3g} m")
+    legend = LegendEntry.ramp(title, colours.HEAT, "0 m", f"{scale * largest:.3g} m")
     return Layer("uncertainty", "Uncertainty of the path", parts, len(sigma), legend=(legend,))
 
 
@@ -247,5 +246,5 @@ def _next_walks(drawing: Drawing, volume: SeenVolume) -> Layer:
         f"walk next: {number + 1} at {x:.1f}, {y:.1f}, {z:.1f} m"
         for number, (x, y, z) in enumerate(places.tolist())
     )
-    part: dict[str, Part] = {WHOLE_MAP: dataclasses.replace(dots, labels=labels)}
+    part = {WHOLE_MAP: dataclasses.replace(dots, labels=labels)}
     return Layer("next_walks", "Where to walk next", part, len(p), notes=notes)

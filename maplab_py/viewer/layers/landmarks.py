@@ -12,11 +12,10 @@ from maplab_py.viewer.drawing import (
     MapImages,
     first_camera,
     first_observer,
-    make_points,
     omission_notes,
     spread_rows,
 )
-from maplab_py.viewer.scene import Entity, Layer, LegendEntry, Part
+from maplab_py.viewer.scene import Entity, Layer, LegendEntry
 from maplab_py.vimap import LandmarkQuality, VIMap
 from maplab_py.vimap.descriptors import type_of_name
 from maplab_py.vimap.queries import observation_counts, observer_counts
@@ -38,14 +37,8 @@ def landmarks(drawing: Drawing) -> list[Layer]:
         if not len(rows) and name != "landmarks":
             continue
         shown = rows[spread_rows(drawing.p_landmarks[rows], limit)]
-        parts: dict[str, Part] = {}
-        for mission_id, members in drawing.by_mission(drawing.landmark_mission[shown]):
-            parts[mission_id] = make_points(
-                drawing.p_landmarks[shown[members]],
-                every[shown[members]],
-                shown[members],
-                point_size(drawing),
-            )
+        p, mission = drawing.p_landmarks[shown], drawing.landmark_mission[shown]
+        parts = drawing.points(mission, p, every[shown], shown, point_size(drawing))
         is_visible = name == "landmarks" or not drawing.options.check_landmark_constrained
         thinned = (len(rows) - len(shown), MAX_POINTS)
         notes = omission_notes(title, len(shown), *_losses(steps, members_of), thinned)
@@ -214,8 +207,8 @@ def _scale_colours(drawing: Drawing, rule: str) -> tuple[U8, tuple[LegendEntry, 
             seconds, options.color_landmarks_by_time_period_seconds
         )
         title, unit = "first observed after", "s"
-    codes = tuple(colours.hex_codes(colours.SEQUENTIAL))
-    legend = LegendEntry(title, codes, f"{low:.1f} {unit}", f"{high:.1f} {unit}")
+    ends = f"{low:.1f} {unit}", f"{high:.1f} {unit}"
+    legend = LegendEntry.ramp(title, colours.SEQUENTIAL, *ends)
     return colours.ramp(part, colours.SEQUENTIAL), (legend,)
 
 
@@ -226,7 +219,6 @@ def _count_colours(drawing: Drawing, rule: str) -> tuple[U8, tuple[LegendEntry, 
         observation_counts(vi_map) if rule == "observations" else observer_mission_counts(vi_map)
     )
     limit = max(drawing.options.landmarks_max_observers, 2)
-    codes = tuple(colours.hex_codes(colours.SEQUENTIAL))
     title = "observations" if rule == "observations" else "observing missions"
-    part = (counts - 1.0) / (limit - 1.0)
-    return colours.ramp(part, colours.SEQUENTIAL), (LegendEntry(title, codes, "1", f"{limit}+"),)
+    legend = LegendEntry.ramp(title, colours.SEQUENTIAL, "1", f"{limit}+")
+    return colours.ramp((counts - 1.0) / (limit - 1.0), colours.SEQUENTIAL), (legend,)

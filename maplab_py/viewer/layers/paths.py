@@ -14,7 +14,7 @@ from maplab_py.viewer.drawing import (
     make_segments,
     spread_rows,
 )
-from maplab_py.viewer.scene import WHOLE_MAP, Axes, Entity, Layer, LegendEntry, Part
+from maplab_py.viewer.scene import WHOLE_MAP, Axes, Entity, Layer, LegendEntry, Part, Segments
 from maplab_py.vimap import TransformationKind
 
 _EDGE_COLOURS = colours.from_hex("#7f9cc0", "#5fa39a", "#b08a5a", "#9a86b8")
@@ -28,10 +28,8 @@ def trajectories(drawing: Drawing) -> Layer:
     mission, p = drawing.vi_map.vertices.mission, drawing.p_vertices
     start = np.flatnonzero(mission[1:] == mission[:-1])
     colour, legend = _vertex_colours(drawing)
-    parts: dict[str, Part] = {}
-    for mission_id, members in drawing.by_mission(mission[start]):
-        rows = start[members]
-        parts[mission_id] = make_segments(p[rows], p[rows + 1], colour[rows], rows, 3.0)
+    ends = p[start], p[start + 1]
+    parts = drawing.segments(mission[start], *ends, colour[start], start, 3.0)
     count = len(drawing.vi_map.missions)
     return Layer("trajectories", "Trajectories", parts, count, legend=legend)
 
@@ -43,8 +41,8 @@ def _vertex_colours(drawing: Drawing) -> tuple[U8, tuple[LegendEntry, ...]]:
         return drawing.mission_colours[table.mission], ()
     since_ns = table.timestamp_ns - table.timestamp_ns[start[table.mission]]
     part, low, high = colours.normalised(np.asarray(1e-9 * since_ns, dtype=np.float64))
-    codes = tuple(colours.hex_codes(colours.SEQUENTIAL))
-    legend = LegendEntry("time of the path", codes, f"{low:.0f} s", f"{high:.0f} s")
+    ends = f"{low:.0f} s", f"{high:.0f} s"
+    legend = LegendEntry.ramp("time of the path", colours.SEQUENTIAL, *ends)
     return colours.ramp(part, colours.SEQUENTIAL), (legend,)
 
 
@@ -52,11 +50,8 @@ def vertices(drawing: Drawing) -> Layer:
     """A dot for each vertex, in the colour of the path."""
     mission = drawing.vi_map.vertices.mission
     colour, _ = _vertex_colours(drawing)
-    parts: dict[str, Part] = {}
-    for mission_id, rows in drawing.by_mission(mission):
-        parts[mission_id] = make_points(
-            drawing.p_vertices[rows], colour[rows], rows, 0.0045 * drawing.unit_m
-        )
+    rows, size_m = np.arange(len(mission)), 0.0045 * drawing.unit_m
+    parts = drawing.points(mission, drawing.p_vertices, colour, rows, size_m)
     return Layer("vertices", "Vertices", parts, len(mission), Entity.VERTEX)
 
 
@@ -106,19 +101,11 @@ def transformation_edges(drawing: Drawing) -> list[Layer]:
     return layers
 
 
-def _edge_parts(drawing: Drawing, start: I32, end: I32, colour: int) -> dict[str, Part]:
-    p, mission = drawing.p_vertices, drawing.vi_map.vertices.mission
+def _edge_parts(drawing: Drawing, start: I32, end: I32, colour: int) -> dict[str, Segments]:
     known = np.flatnonzero((start >= 0) & (end >= 0))
-    return {
-        mission_id: make_segments(
-            p[start[known[members]]],
-            p[end[known[members]]],
-            _EDGE_COLOURS[colour],
-            known[members],
-            2.0,
-        )
-        for mission_id, members in drawing.by_mission(mission[start[known]])
-    }
+    mission = drawing.vi_map.vertices.mission[start[known]]
+    ends = (drawing.p_vertices[rows[known]] for rows in (start, end))
+    return drawing.segments(mission, *ends, _EDGE_COLOURS[colour], known, 2.0)
 
 
 def loop_closures(drawing: Drawing) -> Layer:
@@ -128,11 +115,9 @@ def loop_closures(drawing: Drawing) -> Layer:
     rows = np.flatnonzero((edges.from_vertex >= 0) & (edges.to_vertex >= 0))
     colour = colours.ramp(edges.switch_variable[rows], colours.TRUST)
     part = make_segments(p[edges.from_vertex[rows]], p[edges.to_vertex[rows]], colour, rows, 2.5)
-    legend = LegendEntry("switch value", tuple(colours.hex_codes(colours.TRUST)), "0", "1")
-    parts = {WHOLE_MAP: part}
-    return Layer(
-        "loop_closures", "Loop closures", parts, len(edges), Entity.LOOP_CLOSURE, legend=(legend,)
-    )
+    legend = (LegendEntry.ramp("switch value", colours.TRUST, "0", "1"),)
+    parts, entity = {WHOLE_MAP: part}, Entity.LOOP_CLOSURE
+    return Layer("loop_closures", "Loop closures", parts, len(edges), entity, legend=legend)
 
 
 def base_frames(drawing: Drawing) -> Layer:

@@ -16,8 +16,8 @@ from maplab_py.input_files import SCRIPT_MAX_BYTES, read_text
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.viewer import colours
 from maplab_py.viewer.drawing import Drawing, make_points, make_segments
-from maplab_py.viewer.layers.comparison import reference_landmarks
-from maplab_py.viewer.scene import WHOLE_MAP, Layer, LegendEntry, Part
+from maplab_py.viewer.layers.comparison import reference_landmarks, reference_paths
+from maplab_py.viewer.scene import WHOLE_MAP, Layer, LegendEntry
 from maplab_py.vimap import VIMap, find_mission
 
 
@@ -38,15 +38,10 @@ def compared(drawing: Drawing, other: VIMap) -> list[Layer]:
         drawing: The map as it is shown.
         other: The map to compare with; vertices correspond by id.
     """
-    shift = -drawing.origin_G
-    p = other.T_G_I[:, 4:] + shift
-    mission = other.vertices.mission
-    start = np.flatnonzero(mission[1:] == mission[:-1])
-    path = make_segments(p[start], p[start + 1], colours.REFERENCE, start, 2.0)
-    lines: dict[str, Part] = {WHOLE_MAP: path}
+    shift, grey = -drawing.origin_G, colours.REFERENCE
     return [
-        Layer("reference_trajectories", "Reference paths", lines, len(other.missions)),
-        reference_landmarks(drawing, other, shift, colours.REFERENCE, is_visible=False),
+        reference_paths(other, shift, grey, 2.0),
+        reference_landmarks(drawing, other, shift, grey, is_visible=False),
         _displacements(drawing, other),
     ]
 
@@ -66,9 +61,8 @@ def _displacements(drawing: Drawing, other: VIMap) -> Layer:
     largest = max(float(distance.max(initial=0.0)), 1e-9)
     colour = colours.ramp(distance / largest, colours.HEAT)
     after = drawing.p_vertices[here]
-    codes = tuple(colours.hex_codes(colours.HEAT))
-    legend = LegendEntry("displacement", codes, "0 m", f"{largest:.3g} m")
-    parts: dict[str, Part] = {WHOLE_MAP: make_segments(before, after, colour, here, 1.5)}
+    legend = LegendEntry.ramp("displacement", colours.HEAT, "0 m", f"{largest:.3g} m")
+    parts = {WHOLE_MAP: make_segments(before, after, colour, here, 1.5)}
     return Layer("displacements", "Displacement", parts, len(here), legend=(legend,))
 
 
@@ -124,16 +118,14 @@ def ground_truth(drawing: Drawing, truth: Trajectory) -> list[Layer]:
     path = se3.transform(T_scene_R, truth.T_R_B[inside, 4:])
     path = path[:: max(1, len(path) // 20_000)]
     lines = make_segments(path[:-1], path[1:], colours.TRUTH, np.arange(len(path) - 1), 2.0)
-    whole: dict[str, Part] = {WHOLE_MAP: lines}
     error_m = np.linalg.norm(p_vertex - p_true, axis=1)
     largest = max(float(error_m.max()), 1e-9)
-    codes = tuple(colours.hex_codes(colours.HEAT))
-    legend = (LegendEntry("position error", codes, "0 m", f"{largest:.3g} m"),)
+    legend = (LegendEntry.ramp("position error", colours.HEAT, "0 m", f"{largest:.3g} m"),)
     colour = colours.ramp(error_m / largest, colours.HEAT)
-    errors: dict[str, Part] = {WHOLE_MAP: make_segments(p_true, p_vertex, colour, rows, 1.5)}
-    dots: dict[str, Part] = {WHOLE_MAP: make_points(p_vertex, colour, rows, 0.008 * drawing.unit_m)}
+    errors = {WHOLE_MAP: make_segments(p_true, p_vertex, colour, rows, 1.5)}
+    dots = {WHOLE_MAP: make_points(p_vertex, colour, rows, 0.008 * drawing.unit_m)}
     return [
-        Layer("ground_truth", "Ground truth", whole, len(truth)),
+        Layer("ground_truth", "Ground truth", {WHOLE_MAP: lines}, len(truth)),
         Layer("errors", "Position errors", errors, len(rows), legend=legend),
         Layer("error_colours", "Vertices by error", dots, len(rows), is_visible=False),
     ]
@@ -149,18 +141,9 @@ def marked_segments(drawing: Drawing, segments: MarkedSegments) -> Layer:
     start = segments.first_vertex[owner] + np.arange(len(owner)) - begin
     p = drawing.p_vertices
     mission = drawing.vi_map.vertices.mission
-    parts: dict[str, Part] = {
-        mission_id: make_segments(
-            p[start[members]],
-            p[start[members] + 1],
-            colour[owner[members]],
-            owner[members],
-            7.0,
-        )
-        for mission_id, members in drawing.by_mission(mission[start])
-    }
-    codes = tuple(colours.hex_codes(colours.HEAT))
-    legend = LegendEntry(segments.title, codes, f"{low:.3g}", f"{high:.3g}")
+    ends = p[start], p[start + 1]
+    parts = drawing.segments(mission[start], *ends, colour[owner], owner, 7.0)
+    legend = LegendEntry.ramp(segments.title, colours.HEAT, f"{low:.3g}", f"{high:.3g}")
     return Layer("marked_segments", "Informative segments", parts, len(lengths), legend=(legend,))
 
 
