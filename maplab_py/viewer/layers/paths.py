@@ -104,8 +104,8 @@ def transformation_edges(drawing: Drawing) -> list[Layer]:
 def _edge_parts(drawing: Drawing, start: I32, end: I32, colour: int) -> dict[str, Segments]:
     known = np.flatnonzero((start >= 0) & (end >= 0))
     mission = drawing.vi_map.vertices.mission[start[known]]
-    ends = (drawing.p_vertices[rows[known]] for rows in (start, end))
-    return drawing.segments(mission, *ends, _EDGE_COLOURS[colour], known, 2.0)
+    p_start, p_end = drawing.p_vertices[start[known]], drawing.p_vertices[end[known]]
+    return drawing.segments(mission, p_start, p_end, _EDGE_COLOURS[colour], known, 2.0)
 
 
 def loop_closures(drawing: Drawing) -> Layer:
