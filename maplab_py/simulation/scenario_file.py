@@ -35,12 +35,15 @@ def list_scenarios() -> ScenarioList:
     return ScenarioList(tuple(lines))
 
 
-def load_scenario(name_or_path: str | Path) -> sim.Scenario:
-    """Read a scenario by name, or from a YAML file.
+def load_scenario(name_or_path: str | Path, seed: int | None = None) -> sim.Scenario:
+    """Read a scenario by name, or from a YAML file; a seed takes the place of its own seeds.
 
     Raises:
-        UserError: There is no such scenario, or it has a mistake; names file and key.
+        UserError: There is no such scenario, or it has a mistake (names file and key), or the seed is
+            negative.
     """
+    if seed is not None and seed < 0:
+        raise UserError(f"--seed={seed}: must be 0 or greater")
     path = Path(name_or_path)
     if str(name_or_path) in scenario_names():
         path = _FOLDER / f"{name_or_path}.yaml"
@@ -54,15 +57,12 @@ def load_scenario(name_or_path: str | Path) -> sim.Scenario:
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
         raise UserError(f"cannot read {path}: {reason}") from None
-    return _with_absolute_paths(parse_scenario(text, path.name), path.parent)
+    scenario = _with_absolute_paths(parse_scenario(text, path.name), path.parent)
+    return scenario if seed is None else scenario.with_seed(seed)
 
 
 def parse_scenario(text: str, source: str) -> sim.Scenario:
     """Read a scenario from YAML text.
-
-    Args:
-        text: The YAML document.
-        source: Name of its origin for messages.
 
     Raises:
         UserError: The text has a mistake; names source and key.

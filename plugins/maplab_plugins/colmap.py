@@ -29,7 +29,6 @@ def export_colmap(
     Args:
         colmap_folder: Folder to write into.
         missions: Mission ids or unambiguous prefixes, separated by commas; empty = all.
-        overwrite: Replace files that exist.
     """
     from maplab_py.interop.colmap.exporting import export_colmap as write
 

@@ -55,7 +55,6 @@ def csv_export(
             --export_projected_descriptor; empty, or of another length of descriptors = learned from
             the tracks of the exported missions, as loop closure among them does.
         map_mission: Mission id or unambiguous prefix; empty = all missions.
-        overwrite: Replace files that exist.
     """
     if lc_projection_matrix_filename and not export_projected_descriptor:
         raise UserError(
@@ -101,7 +100,6 @@ def csv_export_vertices_only(
         csv_export_path: Folder to write into; it gets one folder per mission.
         export_absolute_time: Write time stamps as they are; else relative to the first vertex.
         map_mission: Mission id or unambiguous prefix; empty = all missions.
-        overwrite: Replace files that exist.
     """
     options = dataclasses.replace(_ONLY_VERTICES, absolute_time=export_absolute_time)
     return _export_csv(context, csv_export_path, options, map_mission, overwrite)
@@ -191,7 +189,6 @@ def export_ncamera_calibration(
 
     Args:
         ncamera_calibration_export_folder: Folder to write into; files are named by sensor id.
-        overwrite: Replace files that exist.
     """
     from maplab_py.output_files import check_writable, write_text
     from maplab_py.sensors import CameraRig, sensors_yaml, yaml_text

@@ -225,7 +225,6 @@ def create_mesh_from_tsdf_grid(
         dense_tsdf_mesh_min_weight: Weight from which voxels count as observed, in measurements at 2 m.
         dense_result_mesh_colours: Give the vertices the colours of the images in which they are seen; needs
             images and depth maps.
-        overwrite: Replace a file that exists.
     """
     from maplab_py.algorithms.dense.meshing import write_map_mesh
 

@@ -111,7 +111,6 @@ def compare_maps(
             vanished, appeared or moved.
         change_meshes: Folder that gets appeared.ply and vanished.ply, the surfaces where space was free or
             is free now (with --changes; both maps need `tsdf` and `esdf`).
-        overwrite: Replace files that exist.
     """
     other = map_of_key_or_folder(context, other_map)
     files = [change_meshes / f"{kind}.ply" for kind in _CHANGED] if change_meshes else []

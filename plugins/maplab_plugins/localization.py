@@ -78,7 +78,6 @@ def localize(
         truth: The file truth.npz of `simulate`.
         localization_csv: File that gets one line per query.
         localization_json: File that gets the report.
-        overwrite: Replace files that exist.
     """
 
     from maplab_py.algorithms.localization.localization import (

@@ -58,7 +58,7 @@ class WarmupReport(Report):
     folder: str
 
 
-@command("warmup", needs_map=False, acts_outside=True, guards_effects=True)
+@command("warmup", needs_map=False, guards_effects=True)
 def warmup(context: CommandContext) -> WarmupReport:
     """Compile every numeric kernel that the installation does not bring, so that nothing waits later."""
     from maplab_py.warmup import compile_kernels

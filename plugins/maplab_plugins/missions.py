@@ -104,12 +104,11 @@ def _shown_alone(context: CommandContext) -> Iterator[Callable[[int], None]]:
 
     At the end the viewer shows what it showed before.
     """
-    from maplab_plugins.visualization.following import NAME, Following
+    from maplab_plugins.visualization.following import open_viewer
     from maplab_py.viewer.building import Subject
     from maplab_py.vimap.selection import keep_rows
 
-    following = context.session.watchers.find(NAME, Following)
-    viewer = None if following is None or following.viewer.is_stopped else following.viewer
+    viewer = open_viewer(context)
     before = None if viewer is None else viewer.wanted
     if viewer is None or before is None or before.title != context.map_key:
         yield lambda _: None
@@ -192,24 +191,24 @@ def set_all_mission_baseframes_to_unknown(context: CommandContext) -> Message:
 
 
 def _set_known(context: CommandContext, map_mission: str, *, is_known: bool) -> Message:
-    vi_map = context.vi_map
-    if not len(vi_map.missions):
+    missions = context.vi_map.missions
+    if not len(missions):
         raise UserError(f"{context.command}: map '{context.map_key}' has no missions")
     row = context.mission_row(map_mission) if map_mission else 0
-    known = vi_map.baseframes.is_known.copy()
-    known[vi_map.missions.baseframe[row]] = is_known
-    context.commit(vi_map.replace(baseframes=vi_map.baseframes.replace(is_known=known)))
-    state = "known" if is_known else "unknown"
-    return Message(f"base frame of mission {to_hex(vi_map.missions.id[row])} set to {state}")
+    return _mark(context, row, f"frame of mission {to_hex(missions.id[row])}", is_known=is_known)
 
 
 def _set_all(context: CommandContext, *, is_known: bool) -> Message:
+    frames = f"frames of {counted(len(context.vi_map.missions), 'mission')}"
+    return _mark(context, slice(None), frames, is_known=is_known)
+
+
+def _mark(context: CommandContext, rows: int | slice, frames: str, *, is_known: bool) -> Message:
     vi_map = context.vi_map
     known = vi_map.baseframes.is_known.copy()
-    known[vi_map.missions.baseframe] = is_known
+    known[vi_map.missions.baseframe[rows]] = is_known
     context.commit(vi_map.replace(baseframes=vi_map.baseframes.replace(is_known=known)))
-    state = "known" if is_known else "unknown"
-    return Message(f"base frames of {counted(len(vi_map.missions), 'mission')} set to {state}")
+    return Message(f"base {frames} set to {'known' if is_known else 'unknown'}")
 
 
 @command("spatially_distribute_missions")

@@ -43,7 +43,6 @@ def export_colmap_mvs(
         colmap_max_image_size: Longer side of the images in pixels; 0 = as recorded.
         every_nth: Use the images of every n-th vertex of each mission only.
         only_good_landmarks: Leave out landmarks of bad quality.
-        overwrite: Replace files that exist.
     """
     from maplab_py.algorithms.dense import export
 
@@ -96,7 +95,6 @@ def export_for_pmvs_reconstruction(
         pmvs_image_format: Format of the images.
         pmvs_export_data_for_nth_vertex: Use the images of every n-th vertex of each mission only.
         cmvs_use_only_good_landmarks: Leave out landmarks of bad quality.
-        overwrite: Replace files that exist.
     """
     from maplab_py.algorithms.dense.export import (
         UndistortedViews,

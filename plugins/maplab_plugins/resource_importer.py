@@ -53,7 +53,6 @@ def export_images(
     Args:
         dataset_folder: Folder that gets mav0.
         resource_type: Number or name of the type of image or depth map.
-        overwrite: Replace files that exist.
     """
     from maplab_py.storage.resources.types import resource_type_of
 

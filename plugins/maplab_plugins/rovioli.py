@@ -48,7 +48,6 @@ _SECONDS_TO_DRAW = 20.0
     "rovioli",
     example="rovioli walk --save_map_folder=walk_map",
     needs_map=False,
-    acts_outside=True,
     guards_effects=True,
     reads=(
         "datasource_folder",

@@ -132,10 +132,7 @@ def collect_segments(
     reads=("database",),
 )
 def segment_database_stats(
-    context: CommandContext,  # noqa: ARG001
-    *,
-    database: Path,
-    size: SizeOptions = SizeOptions(),
+    _: CommandContext, *, database: Path, size: SizeOptions = SizeOptions()
 ) -> reports.DatabaseReport:
     """Show tables, scores, parameters and segments of a segment database."""
     from maplab_py.algorithms.self_calibration.segments.database import load_database
@@ -225,7 +222,7 @@ def suggest_motion(
     Args:
         suggestions: Number of motions.
     """
-    from maplab_plugins.visualization.following import NAME, Following
+    from maplab_plugins.visualization.following import open_viewer
     from maplab_py.algorithms.self_calibration.segments.database import load_database
     from maplab_py.online_calibration.suggestions import suggest_motion as suggest
 
@@ -238,10 +235,9 @@ def suggest_motion(
         count=suggestions,
         progress=context.progress,
     )
-    following = context.session.watchers.find(NAME, Following)
-    if following is not None and not following.viewer.is_stopped:
+    if (viewer := open_viewer(context)) is not None:
         motion = "" if report.sufficient else report.suggestions[0].motion
-        following.viewer.motion.show(motion, report.known_share)
+        viewer.motion.show(motion, report.known_share)
     return report
 
 
@@ -249,7 +245,6 @@ def suggest_motion(
     "export_segments",
     example="export_segments --database=device.segments --map_folder=segments",
     needs_map=False,
-    acts_outside=True,
     guards_effects=True,
 )
 def export_segments(
@@ -297,7 +292,6 @@ def evaluate_segment_information(
         group: Group that the plot and the file show.
         plot: Write the trajectory from above, coloured by information, to this SVG file.
         csv: Write segments with their information to this file, which the viewer reads.
-        overwrite: Replace files that exist.
     """
     from maplab_py.algorithms.self_calibration import drawing
     from maplab_py.algorithms.self_calibration.segments.selection import segment_information
@@ -373,7 +367,6 @@ def export_calibration(
     Args:
         folder: Destination folder; created if missing.
         format: File format.
-        overwrite: Replace files that exist.
     """
     from maplab_py.algorithms.self_calibration.device import device_of, imu_rate_hz
     from maplab_py.interop.calibration_export import exported

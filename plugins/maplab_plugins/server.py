@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from maplab_py.algorithms.pose_graph_manipulation.stationary_options import StationaryOptions
 from maplab_py.cancellation import ending_early, lasting_effect
-from maplab_py.plugin import CommandContext, Message, UserError, command
+from maplab_py.plugin import CommandContext, Message, command
 from maplab_py.report import counted
 from maplab_py.server import options as server_options
 
@@ -25,7 +25,6 @@ _SECONDS_BETWEEN_LOOKS = 0.2
     "serve",
     example="serve --spool=spool --maplab_server_merged_map_folder=city --serve_stop_when_idle_s=1",
     needs_map=False,
-    acts_outside=True,
     guards_effects=True,
     see_also=("push", "serve_status", "serve_stop", "simulate_robots", "load_merge_submap"),
 )
@@ -73,17 +72,11 @@ def serve(
     "push",
     example="push submap_1 --spool=spool --robot_name=ant",
     needs_map=False,
-    acts_outside=True,
     guards_effects=True,
     see_also=("serve",),
 )
 def push(
-    context: CommandContext,  # noqa: ARG001
-    map_folder: Path,
-    *,
-    spool: Path,
-    robot_name: str = "robot",
-    name: str = "",
+    _: CommandContext, map_folder: Path, *, spool: Path, robot_name: str = "robot", name: str = ""
 ) -> server_options.PushReport:
     """Put a submap into the spool of a map server: copied, compared with its checksum, then renamed.
 
@@ -169,10 +162,7 @@ def serve_stop(context: CommandContext, *, spool: Path, wait_s: float = 0.0) -> 
     see_also=("delete_all_robot_missions", "remove_mission"),
 )
 def delete_mission(
-    context: CommandContext,  # noqa: ARG001
-    *,
-    spool: Path,
-    map_mission: str,
+    _: CommandContext, *, spool: Path, map_mission: str
 ) -> server_options.DeletedMissions:
     """Remove a mission from the map of a server for good; its later submaps are refused.
 
@@ -190,10 +180,7 @@ def delete_mission(
     see_also=("delete_mission",),
 )
 def delete_all_robot_missions(
-    context: CommandContext,  # noqa: ARG001
-    *,
-    spool: Path,
-    robot_name: str,
+    _: CommandContext, *, spool: Path, robot_name: str
 ) -> server_options.DeletedMissions:
     """Remove all missions of a robot from the map of a server; submaps of new ones are accepted.
 
@@ -210,7 +197,7 @@ def delete_all_robot_missions(
     see_also=("serve",),
 )
 def map_lookup(
-    context: CommandContext,  # noqa: ARG001
+    _: CommandContext,
     *,
     spool: Path,
     robot_name: str,
@@ -250,7 +237,7 @@ def map_lookup(
     see_also=("serve",),
 )
 def get_dense_map_in_range(
-    context: CommandContext,  # noqa: ARG001
+    _: CommandContext,
     *,
     spool: Path,
     center_G: str,
@@ -285,7 +272,6 @@ def get_dense_map_in_range(
     "simulate_robots",
     example="simulate_robots --spool=spool --scenario=single_session --robots_rate=0",
     needs_map=False,
-    acts_outside=True,
     guards_effects=True,
     see_also=("serve", "simulate", "evaluate_map"),
 )
@@ -370,12 +356,7 @@ def _simulated_sessions(
     from maplab_py.simulation.scenario_file import load_scenario
     from maplab_py.simulation.simulate import simulate
 
-    description = load_scenario(scenario)
-    if seed is not None:
-        if seed < 0:
-            raise UserError(f"--seed={seed}: must be 0 or greater")
-        description = description.with_seed(seed)
-    data = simulate(description, progress=context.progress)
+    data = simulate(load_scenario(scenario, seed), progress=context.progress)
     truth.parent.mkdir(parents=True, exist_ok=True)
     data.truth.save(truth)
     return {f"robot_{number + 1}": vi_map for number, vi_map in enumerate(data.maps)}

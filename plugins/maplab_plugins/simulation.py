@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from maplab_py.plugin import CommandContext, EstimationError, UserError, command
+from maplab_py.plugin import CommandContext, EstimationError, command
 
 if TYPE_CHECKING:
     from maplab_py.simulation import evaluation, reports
@@ -20,7 +20,7 @@ _DEFAULT_SCENARIO = "three_sessions"
 
 
 @command("list_scenarios", needs_map=False, see_also=("simulate",))
-def list_scenarios(context: CommandContext) -> reports.ScenarioList:  # noqa: ARG001
+def list_scenarios(_: CommandContext) -> reports.ScenarioList:
     """List the scenarios that `simulate` knows by name."""
     from maplab_py.simulation.scenario_file import list_scenarios as listed
 
@@ -31,7 +31,6 @@ def list_scenarios(context: CommandContext) -> reports.ScenarioList:  # noqa: AR
     "simulate",
     example="simulate --scenario=three_sessions --seed=7 --map_folder=simulated",
     needs_map=False,
-    acts_outside=True,
     guards_effects=True,
     see_also=("list_scenarios", "evaluate_map", "load_merge_all_maps"),
 )
@@ -55,8 +54,9 @@ def simulate(
         overwrite: Replace maps that are there already.
     """
     from maplab_py.simulation.raw_data import refuse_used_folder, write_maps
+    from maplab_py.simulation.scenario_file import load_scenario
 
-    description = _scenario(scenario, seed)
+    description = load_scenario(scenario, seed)
     refuse_used_folder(map_folder, overwrite=overwrite)
     return write_maps(
         description, map_folder, raw_data=raw_data, overwrite=overwrite, progress=context.progress
@@ -85,7 +85,6 @@ def evaluate_map(context: CommandContext, *, truth: Path) -> evaluation.MapError
     "demo",
     example="demo --map_folder=maplab_demo",
     needs_map=False,
-    acts_outside=True,
     guards_effects=True,
     see_also=("simulate",),
 )
@@ -105,20 +104,12 @@ def demo(
     """
     from maplab_py.simulation.demo import MAP_KEY, SCENARIO, demonstrate
     from maplab_py.simulation.raw_data import refuse_used_folder
+    from maplab_py.simulation.scenario_file import load_scenario
 
     refuse_used_folder(map_folder, overwrite=overwrite)
     context.maps.check_new_key(MAP_KEY)
-    scenario = _scenario(SCENARIO, seed)
+    scenario = load_scenario(SCENARIO, seed)
     return demonstrate(_DemoConsole(context), scenario, map_folder, overwrite=overwrite)
-
-
-def _scenario(name: str, seed: int | None) -> Scenario:
-    from maplab_py.simulation.scenario_file import load_scenario
-
-    if seed is not None and seed < 0:
-        raise UserError(f"--seed={seed}: must be 0 or greater")
-    scenario = load_scenario(name)
-    return scenario if seed is None else scenario.with_seed(seed)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -26,7 +26,6 @@ _WELCOME = (
     "tour",
     example="tour --folder=maplab_tour",
     needs_map=False,
-    acts_outside=True,
     guards_effects=True,
     see_also=("demo", "help"),
 )

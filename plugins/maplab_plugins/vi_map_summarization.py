@@ -62,10 +62,7 @@ def generate_summary_map_and_save_to_disk(
     reads=("summary_map",),
 )
 def print_summary_map(
-    context: CommandContext,  # noqa: ARG001
-    summary_map: Path,
-    *,
-    size: SizeOptions = SizeOptions(),
+    _: CommandContext, summary_map: Path, *, size: SizeOptions = SizeOptions()
 ) -> summary_options.SummaryMapContent:
     """Check a summary map and show its content.
 

@@ -52,7 +52,7 @@ _OUTPUTS = (
 )
 """Flags that name what a command writes, maplab's names among them; a command has one of them at most."""
 _USUAL_HELP = {
-    "overwrite": "Replace the file if it exists.",
+    "overwrite": "Replace files that exist.",
     "map_mission": "Mission id or unambiguous prefix; may be omitted if the map has only one.",
     "yes": "Do not ask for confirmation.",
     "plot_file": "File to write; the suffix gives the format.",
@@ -161,8 +161,8 @@ def command(
         writes_files: All that the command does outside the maps is to write files through
             `maplab_py.output_files`. They appear together when it ends well, none when it fails or
             is cancelled; --dry_run tells which files it would write.
-        guards_effects: The command acts outside, but only inside `lasting_effect()`. Ctrl-C then
-            waits only while it is in such a block.
+        guards_effects: The command acts outside, too, but only inside `lasting_effect()`. Ctrl-C
+            then waits only while it is in such a block.
         obeys_dry_run: The command acts outside, but where `context.is_trial` is set it only checks
             and returns a report of what it would do.
         completes: Values that the prompt proposes, by flag: "snapshot", "job", "alias", "map",
@@ -185,7 +185,7 @@ def command(
             see_also=see_also,
             needs_map=needs_map,
             raw_arguments=raw_arguments,
-            acts_outside=acts_outside,
+            acts_outside=acts_outside or guards_effects,
             writes_files=writes_files,
             guards_effects=guards_effects,
             obeys_dry_run=obeys_dry_run,

@@ -115,10 +115,7 @@ class ReadingOptions(CacheOptions, SizeOptions):
     needs_map=False,
     reads=("maps_folder",),
 )
-def list_maps_on_file_system(
-    context: CommandContext,  # noqa: ARG001
-    maps_folder: Path,
-) -> FolderList:
+def list_maps_on_file_system(_: CommandContext, maps_folder: Path) -> FolderList:
     """List the map folders below a folder."""
     return FolderList(maps_folder, tuple(str(p) for p in _folders_below(maps_folder)))
 

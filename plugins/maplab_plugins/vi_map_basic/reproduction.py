@@ -38,7 +38,6 @@ class Reproduction(Report):
     "reproduce",
     example="reproduce merged",
     needs_map=False,
-    acts_outside=True,
     guards_effects=True,
     reads=("card",),
     see_also=("history", "compare_maps", "save"),

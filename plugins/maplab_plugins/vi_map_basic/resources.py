@@ -155,7 +155,7 @@ def use_external_resource_folder(context: CommandContext, resource_folder: Path)
 
 
 @command("resource_cache_statistics", "res_cache_stats")
-def resource_cache_statistics(context: CommandContext) -> CacheReport | Message:  # noqa: ARG001
+def resource_cache_statistics(_: CommandContext) -> CacheReport | Message:
     """Show how often resources came from the cache (hits) and from disk (misses), by type."""
     from maplab_py.storage.resources.store import SHARED_CACHE
 
@@ -207,7 +207,6 @@ def remove_resources(
 @command(
     "clean_up_resource_folders",
     example="clean_up_resource_folders --remove_orphans --yes",
-    acts_outside=True,
     guards_effects=True,
     obeys_dry_run=True,
     see_also=("list_resource_folders", "remove_resources", "check_map_consistency"),

@@ -102,7 +102,6 @@ class SaveOptions(Options):
     "save",
     example="save --map_folder=maps/merged",
     see_also=("save_all",),
-    acts_outside=True,
     guards_effects=True,
     obeys_dry_run=True,
 )
@@ -134,7 +133,6 @@ def save(
     "save_all",
     example="save_all --maps_folder=results",
     needs_map=False,
-    acts_outside=True,
     guards_effects=True,
     obeys_dry_run=True,
 )

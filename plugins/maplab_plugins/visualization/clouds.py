@@ -32,7 +32,7 @@ def _viewer(name: str, resource: str, what: str) -> Callable[..., ViewReport]:
         return _show(context, resource, clouds, options, display)
 
     view.__doc__ = f"Show the {what}."
-    return command(name, acts_outside=True, guards_effects=True)(view)
+    return command(name, guards_effects=True)(view)
 
 
 visualize_xyz_pointclouds = _viewer(
@@ -56,7 +56,7 @@ visualize_optimized_depth_map_pointclouds = _viewer(
 )
 
 
-@command("visualize_xyzi_pointclouds_from_mission", acts_outside=True, guards_effects=True)
+@command("visualize_xyzi_pointclouds_from_mission", guards_effects=True)
 def visualize_xyzi_pointclouds_from_mission(
     context: CommandContext,
     *,
@@ -70,7 +70,7 @@ def visualize_xyzi_pointclouds_from_mission(
     return _show(context, _INTENSITIES, clouds, options, display, np.array([row]))
 
 
-@command("visualize_xyzi_pointclouds_sequentially", acts_outside=True, guards_effects=True)
+@command("visualize_xyzi_pointclouds_sequentially", guards_effects=True)
 def visualize_xyzi_pointclouds_sequentially(
     context: CommandContext,
     *,

@@ -137,18 +137,24 @@ def in_colours(subject: Subject) -> Subject:
     return subject.replace(options=dataclasses.replace(options, color_paths_by_time=True))
 
 
+def open_viewer(context: CommandContext) -> Viewer | None:
+    """Return the viewer of the session, None where none is running."""
+    following = context.session.watchers.find(NAME, Following)
+    return None if following is None or following.viewer.is_stopped else following.viewer
+
+
 def verdicts_of_page(context: CommandContext) -> list[list[str]]:
     """Return the ids of closures that were accepted, and of those refused, in the page; forget them there.
 
     Raises:
         UserError: None were.
     """
-    following = context.session.watchers.find(NAME, Following)
-    if following is None or following.viewer.is_stopped:
+    viewer = open_viewer(context)
+    if viewer is None:
         raise UserError(
             "judge_closures: give --accept or --refuse, or judge in the page: visualize"
         )
-    verdicts = following.viewer.court.take_verdicts()
+    verdicts = viewer.court.take_verdicts()
     if not verdicts:
         raise UserError(
             "judge_closures: no verdict was given in the page (Closure court); give --accept or --refuse"
@@ -162,10 +168,10 @@ def running_viewer(context: CommandContext) -> Viewer:
     Raises:
         UserError: None is running.
     """
-    following = context.session.watchers.find(NAME, Following)
-    if following is None or following.viewer.is_stopped:
+    viewer = open_viewer(context)
+    if viewer is None:
         raise UserError(f"{context.command}: no viewer is running; start one: visualize")
-    return following.viewer
+    return viewer
 
 
 @contextmanager
@@ -175,9 +181,8 @@ def viewer_for_output(context: CommandContext) -> Iterator[Viewer]:
     Raises:
         UserError: None is running, and the selected map cannot be shown.
     """
-    following = context.session.watchers.find(NAME, Following)
-    if following is not None and not following.viewer.is_stopped:
-        yield following.viewer
+    if (running := open_viewer(context)) is not None:
+        yield running
         return
     from maplab_py.viewer.building import Subject
     from maplab_py.viewer.display.viewer import Viewer
@@ -196,9 +201,8 @@ def ensure_viewer(context: CommandContext, options: ViewerOptions) -> Viewer:
     """Return the session's viewer; start one when none is running or another port is wanted."""
     from maplab_py.viewer.display.viewer import Viewer
 
-    following = context.session.watchers.find(NAME, Following)
-    if following is not None and not following.viewer.is_stopped:
-        return following.viewer
+    if (running := open_viewer(context)) is not None:
+        return running
     viewer = Viewer(options.port, is_dark=options.dark)
     try:
         with lasting_effect():

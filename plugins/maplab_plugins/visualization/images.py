@@ -22,7 +22,7 @@ def _player(name: str, what: str, example: str = "") -> Callable[..., ViewReport
         return _show(context, resource, playback, display)
 
     play.__doc__ = f"Play the missions with {what}."
-    return command(name, example=example, acts_outside=True, guards_effects=True)(play)
+    return command(name, example=example, guards_effects=True)(play)
 
 
 visualize_raw_images = _player(

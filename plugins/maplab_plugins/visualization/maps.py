@@ -36,7 +36,6 @@ class DifferenceReport(Report):
     "v",
     example="visualize --vis_color_landmarks_by_height",
     see_also=("visualize_sequentially", "save_view", "export_view", "viewer_keep", "viewer_stop"),
-    acts_outside=True,
     guards_effects=True,
 )
 def visualize(
@@ -71,9 +70,7 @@ def visualize(
     return show(context, subject, display)
 
 
-@command(
-    "visualize_sequentially", "vs", see_also=("visualize",), acts_outside=True, guards_effects=True
-)
+@command("visualize_sequentially", "vs", see_also=("visualize",), guards_effects=True)
 def visualize_sequentially(
     context: CommandContext,
     *,
@@ -90,7 +87,7 @@ def visualize_sequentially(
     return show(context, subject, display, playback=playback, plays=True)
 
 
-@command("visualize_landmark_observers", acts_outside=True, guards_effects=True)
+@command("visualize_landmark_observers", guards_effects=True)
 def visualize_landmark_observers(
     context: CommandContext,
     *,
@@ -104,7 +101,7 @@ def visualize_landmark_observers(
     return show(context, subject, display)
 
 
-@command("visualize_sensor_extrinsics", acts_outside=True, guards_effects=True)
+@command("visualize_sensor_extrinsics", guards_effects=True)
 def visualize_sensor_extrinsics(
     context: CommandContext, *, display: ViewerOptions = ViewerOptions()
 ) -> ViewReport:
@@ -115,7 +112,7 @@ def visualize_sensor_extrinsics(
     return show(context, Subject(context.vi_map, title, shows_sensors=True), display)
 
 
-@command("visualize_loop_closures", acts_outside=True, guards_effects=True)
+@command("visualize_loop_closures", guards_effects=True)
 def visualize_loop_closures(
     context: CommandContext,
     *,
@@ -148,7 +145,6 @@ def visualize_loop_closures(
     "visualize_difference",
     example="visualize_difference --with_snapshot=before",
     see_also=("snapshot", "undo"),
-    acts_outside=True,
     guards_effects=True,
 )
 def visualize_difference(
@@ -199,7 +195,6 @@ def visualize_difference(
     "visualize_changes",
     example="visualize_changes tuesday",
     see_also=("compare_maps", "update_map"),
-    acts_outside=True,
     guards_effects=True,
 )
 def visualize_changes(

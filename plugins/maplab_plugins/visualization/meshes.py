@@ -10,7 +10,6 @@ from maplab_py.viewer.options import MeshColouring, VisualizationOptions
 
 @command(
     "visualize_mesh",
-    acts_outside=True,
     guards_effects=True,
     see_also=("create_mesh_from_tsdf_grid", "create_tsdf_from_depth_resource"),
 )
@@ -60,7 +59,6 @@ def visualize_mesh(
 
 @command(
     "visualize_esdf",
-    acts_outside=True,
     guards_effects=True,
     see_also=("create_esdf_from_depth_resource",),
 )

@@ -43,7 +43,6 @@ class ExportedView(Report):
     "save_view",
     example="save_view --file=map.png",
     see_also=("export_view",),
-    acts_outside=True,
     guards_effects=True,
 )
 def save_view(
@@ -66,7 +65,6 @@ def save_view(
         width_px: Width of the picture.
         height_px: Height of the picture.
         view: Where to look from; empty = as the newest open page does.
-        overwrite: Replace a file that is there already.
     """
     check_writable(file, overwrite=overwrite)
     for name, size in (("width_px", width_px), ("height_px", height_px)):
@@ -95,7 +93,6 @@ def export_view(context: CommandContext, *, file: Path, overwrite: bool = False)
 
     Args:
         file: The file.
-        overwrite: Replace a file that is there already.
     """
     check_writable(file, overwrite=overwrite)
     with viewer_for_output(context) as viewer:
@@ -107,7 +104,6 @@ def export_view(context: CommandContext, *, file: Path, overwrite: bool = False)
     "go",
     example="viewer_go_to 59f0",
     see_also=("visualize", "why"),
-    acts_outside=True,
     guards_effects=True,
 )
 def viewer_go_to(context: CommandContext, id_: str) -> Message:
@@ -124,9 +120,7 @@ def viewer_go_to(context: CommandContext, id_: str) -> Message:
     return Message(f"{context.session.variables['pick'][:8]} is selected in the viewer")
 
 
-@command(
-    "viewer_stop", needs_map=False, see_also=("visualize",), acts_outside=True, guards_effects=True
-)
+@command("viewer_stop", needs_map=False, see_also=("visualize",), guards_effects=True)
 def viewer_stop(context: CommandContext) -> Message:
     """Stop the viewer; its page stays open and shows nothing new."""
     url = running_viewer(context).url
@@ -140,7 +134,6 @@ def viewer_stop(context: CommandContext) -> Message:
     example="viewer_keep --duration_s=1",
     needs_map=False,
     see_also=("visualize", "rovioli"),
-    acts_outside=True,
     guards_effects=True,
 )
 def viewer_keep(context: CommandContext, *, duration_s: float = 0.0) -> Message:
