@@ -23,8 +23,6 @@ def exported(
     """Return file names and contents.
 
     Args:
-        imu_id: IMU.
-        rig_id: Camera rig.
         form: maplab, kalibr, openvins or basalt.
         imu_rate_hz: For the formats that name it.
 

@@ -118,10 +118,8 @@ def export_csv_dataset(
 
     Args:
         folder: Output folder; created if it does not exist.
-        options: Tables to write.
         missions: Mission rows; None = all.
         projector: Write projected descriptors instead of their bytes; None = bytes.
-        overwrite: Replace files that exist.
 
     Raises:
         UserError: A file exists and `overwrite` is not set (nothing is written then), or a file

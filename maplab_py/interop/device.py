@@ -100,8 +100,6 @@ def make_device(
     Args:
         cameras: Cameras without ids; none = the device is an IMU alone.
         T_I_C: Poses (C, 7) on the IMU, without IMU on the first camera.
-        imu: IMU without id.
-        notes: For the user.
     """
     sensors: dict[str, sensor_set.Sensor] = {}
     rig_id, imu_id = "", ""

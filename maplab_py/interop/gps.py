@@ -103,7 +103,6 @@ def gps_track(
     Args:
         times_ns: Stamps (N,).
         fixes: Latitude, longitude [deg] and altitude [m] (N, 3).
-        source: Name of the file.
         reasons: Why each row (N,) is known to be no fix; empty = it may be one.
         lines: Line of each row, for messages.
 

@@ -138,10 +138,7 @@ def raw_pixels(
     Args:
         name: Of the image, for messages.
         encoding: Name in ROS.
-        width_px: Width.
-        height_px: Height.
         step: Bytes of a row.
-        data: Buffer.
         is_big_endian: Words of 16 bits begin with the upper byte.
 
     Raises:
@@ -180,7 +177,6 @@ def encoded_pixels(name: str, data: bytes, form: str = "") -> Pixels:
 
     Args:
         name: Of the image, for messages.
-        data: The file.
         form: `format` of a CompressedImage, as in "bayer_rggb8; png compressed".
 
     Raises:

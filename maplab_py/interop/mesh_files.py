@@ -35,7 +35,6 @@ def write_mesh(
         faces: Triangles (F, 3), anticlockwise as seen from outside.
         path: File with the suffix .ply, .obj, .stl or .glb.
         colours: Red, green and blue (N, 3) of the vertices; STL has none.
-        overwrite: Replace a file that exists.
 
     Raises:
         UserError: The suffix is another one, or the file cannot be written.

@@ -156,7 +156,6 @@ def _check_turns(track: WheelTrack, velocities: F64 | None) -> None:
     """Check that most turns are slower than any that are in radians.
 
     Args:
-        track: The poses.
         velocities: Angular velocities (N, 1 or 3) where these were measured.
     """
     if velocities is not None:

@@ -64,8 +64,6 @@ def detect(
         poses: Where it is, and when.
         world: Points and what hides them.
         is_there: Mask (L,) of the points that exist in this session.
-        options: Limits, probabilities and noise.
-        rng: Source of all of it.
     """
     frame, point, uv, view, distance = _visible(camera, poses, world, is_there, options)
     detected = rng.uniform(size=len(frame)) < options.detection_probability

@@ -224,7 +224,6 @@ def write_images(
     """Render and write all images of a session; the bytes do not depend on the number of threads.
 
     Args:
-        scenario: The whole scenario.
         number: Which of its sessions.
         session: What was recorded, with the true motion and cameras.
         painted: The scene as this session sees it.

@@ -62,12 +62,8 @@ def record(
     """Move the device through the world and record its measurements.
 
     Args:
-        scenario: The whole scenario.
         number: Which of its sessions.
-        world: The world that all sessions share.
-        device: The recording device.
         appearance: Appearance of the world in this session.
-        seeds: Generators of this session.
         spline: The motion; None = that of the session's options.
 
     Raises:
@@ -202,7 +198,6 @@ def recorded_samples(options: SessionOptions, lead_s: float = 0.0) -> RecordedSa
     """Read the recorded IMU samples of a session, None if it has simulated ones.
 
     Args:
-        options: The session.
         lead_s: Time without samples at both ends of the motion [s].
 
     Raises:

@@ -415,9 +415,7 @@ def wheel_velocities(
     """Measure velocities whose integral over the time between two vertices has the stated errors.
 
     Args:
-        recording: The true motion.
         options: Mounting, scale, and deviations per edge between vertices.
-        rng: Random generator of the errors.
     """
     stamps = recording.imu_time_ns
     step = max(1, round(1e9 / _RATE_HZ / float(np.median(np.diff(stamps)))))

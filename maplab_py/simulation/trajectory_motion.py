@@ -31,7 +31,6 @@ def trajectory_spline(
     samples); between them the spline is smoother than the file.
 
     Args:
-        options: The session.
         world: Determines where the middle is.
         together: Sessions that share a frame, with this one: the middle is that of all, and the
             first of them begins at its `height_m`. None = the session is placed by itself.

@@ -136,9 +136,7 @@ def session_truth(
 
     Args:
         vi_map: Its map, for the ids.
-        recording: What was recorded, with the true motion.
         device: With the true calibration.
-        world: The world's points.
         point_of: World point (L,) of every landmark of the map.
         loop_edge_is_true: Which loop closure edges (E,) of the map join what they claim to.
     """
@@ -258,9 +256,6 @@ def true_poses(
     """Return the true poses of the queries, and T_R_G (7,) from the true poses of the observers.
 
     Args:
-        query: The map of the queries.
-        localizations: The localised poses.
-        database: What was searched.
         path: The file truth.npz of `simulate`.
 
     Raises:

@@ -397,7 +397,6 @@ def street_route(options: WorldOptions, first: tuple[int, int], last: tuple[int,
     """Return the closed route (4096, 2) in the streets round a rectangle of blocks, anticlockwise.
 
     Args:
-        options: The world.
         first: Column and row of the block at the rectangle's lower corner.
         last: Column and row of the block at its upper corner.
     """

@@ -107,7 +107,6 @@ def check_listed_edges(
     """Compare the edges that vertices list with the edges that start and end there.
 
     Args:
-        content: Entities of all files.
         kinds: Kind of every edge.
         vertex_index: Rows of vertices in file order.
         repair: Use the edges instead of raising an error.

@@ -266,7 +266,6 @@ def omission_notes(title: str, drawn: int, *reasons: tuple[int, str]) -> tuple[s
     """Return a line that says how many elements each reason leaves out; nothing if none does.
 
     Args:
-        title: Title of the layer.
         drawn: The number of elements that are drawn.
         reasons: How many elements are left out, and why.
     """

@@ -102,7 +102,6 @@ def plugin_layers(drawing: Drawing, taken: set[str]) -> tuple[list[Layer], list[
     """Return the layers of all plugins, and a line for each that cannot be drawn.
 
     Args:
-        drawing: The drawing that they are part of.
         taken: Names of layers that are there already.
     """
     layers, problems = [], []

@@ -50,7 +50,6 @@ def pick(
     close by; among things at nearly the same angle the front one wins.
 
     Args:
-        scene: What is shown.
         origin: Where the ray begins (3,), in the scene.
         direction: Its direction (3,).
         layers: Names of the layers that are visible; None = all.
@@ -121,7 +120,6 @@ def find_by_id(drawing: Drawing, text: str) -> Pick:
     A mission is represented by its first vertex.
 
     Args:
-        drawing: The map as it is drawn.
         text: 4 to 32 hexadecimal digits.
 
     Raises:

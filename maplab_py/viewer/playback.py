@@ -117,7 +117,6 @@ def moved_scene(scene: Scene, drawing: Drawing, vi_map: VIMap) -> Scene:
     """Return the scene with trajectories, vertices and landmarks where a map has them now.
 
     Args:
-        scene: The scene as it is shown.
         drawing: What it was drawn of.
         vi_map: A map with the same rows whose positions differ.
     """
@@ -168,7 +167,6 @@ def vertex_signals(drawing: Drawing, truth: Trajectory | None = None) -> tuple[S
     """Return what is known of all vertices of a map; what no vertex has is left out.
 
     Args:
-        drawing: The map as it is drawn.
         truth: True trajectory to compare the positions with.
     """
     vi_map = drawing.vi_map

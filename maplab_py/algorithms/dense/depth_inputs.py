@@ -81,7 +81,6 @@ def fuse_views(
         depth: Depth of frames.
         resources: Rows (K,) of the resources.
         poses: Poses (K, 7) of their cameras in the frame of the grid.
-        settings: Of the grid.
         with_free_space: The grid also has the space between cameras and surfaces.
 
     Raises:

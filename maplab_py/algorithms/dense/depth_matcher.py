@@ -39,10 +39,6 @@ class DepthMatcher:
         """Prepare the matcher.
 
         Args:
-            pair: The cameras.
-            stereo: Preparation and checks.
-            sgbm: Semi-global block matching.
-            bm: Block matching.
             near_m: Depth of the nearest surfaces of the scene; infinite where it is not known.
 
         Raises:

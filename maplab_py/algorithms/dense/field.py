@@ -252,13 +252,9 @@ def create_fields(
     the first of its missions and is in the frame of that mission.
 
     Args:
-        map_folder: Its folder.
         missions: Rows of missions; None = all.
-        options: Distances.
-        fusion: Voxels and weights.
         min_weight: Weight from which voxels count as observed for the surface.
         input_type: Number of the resource type of the depth; None = see `depth_type`.
-        overwrite: Replace fields that the missions have.
 
     Raises:
         UserError: There is no depth, or a mission has a field already.

@@ -74,12 +74,9 @@ def fuse_depth(
     A grid belongs to the first of its missions and is in the frame of that mission.
 
     Args:
-        map_folder: Its folder.
         missions: Rows of missions; None = all.
-        options: Voxels and weights.
         input_type: Number of the resource type of the depth; None = the first of optimised depth
             maps, raw depth maps and clouds that there is.
-        overwrite: Replace grids that the missions have.
 
     Raises:
         UserError: There is no depth, or a mission has a grid already.
@@ -142,7 +139,6 @@ def update_grids(
     Depth resources that the map does not have any more are errors, because nothing could take them out.
 
     Args:
-        map_folder: Its folder.
         missions: Rows of missions; None = all.
         options: What is not at its default must be as in the grids; None = all defaults.
         input_type: Number of the resource type that must be in the grids; None = any.
@@ -236,7 +232,6 @@ def _follow(
 
     Args:
         stored: Grid with the poses so far; it is changed.
-        depth: Depth maps.
         resources: Rows (K,) of those in the grid.
         moved: Which of them (K,) have moved.
         T_M_C: Present poses (K, 7) of those, the poses in the grid of the others.

@@ -105,7 +105,6 @@ class TsdfGrid:
 
         Args:
             depth: Depths along the optical axis, 0 = unknown.
-            pinhole: Camera.
             T_G_C: Its pose.
             with_free_space: Also make the blocks between the camera and the surface.
 

@@ -37,7 +37,6 @@ def map_mesh(
     """Return the surface of the grids of missions in G, and the number of grids.
 
     Args:
-        map_folder: Its folder.
         missions: Rows of missions; None = all.
         min_weight: Weight from which voxels count as observed.
         most: Largest distance of a voxel beside a surface, as a share of the truncation.
@@ -106,7 +105,6 @@ def vertex_colours(
     1 / depth^2. Points that no image shows are grey.
 
     Args:
-        map_folder: Its folder.
         p_G: Points in the global frame.
         missions: Rows of missions; None = all.
 

@@ -94,11 +94,8 @@ def reconstruct_stereo(
     """Compute depth for every vertex that has images of a stereo pair.
 
     Args:
-        map_folder: Its folder.
         missions: Rows of missions; None = all.
-        settings: Options.
         output_type: Number of the resource type of the results, one of OUTPUT_TYPES.
-        overwrite: Replace resources of this type that the frames have.
 
     Raises:
         UserError: There are no images or no stereo pair, or a frame has depth already.
@@ -266,7 +263,6 @@ def _confirm(
         depths: Rectified depths (H, W) [m] of consecutive vertices.
         T_G_P: Poses (N, 4, 4) of the rectified cameras.
         offsets: Steps to the neighbours.
-        pair: The stereo pair.
         options: How many must agree, and how well.
     """
     pinhole = pair.pinhole

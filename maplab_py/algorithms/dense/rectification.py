@@ -48,7 +48,6 @@ def stereo_pairs(
     """Rectify the pairs of cameras that are suitable for stereo.
 
     Args:
-        rig: Cameras.
         min_baseline_m: Smallest distance.
         max_angle_rad: Largest angle between the optical axes.
         scale: Size of rectified images, as a fraction of the left camera's.

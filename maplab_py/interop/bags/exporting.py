@@ -46,17 +46,13 @@ def export_bag(
     overwrite: bool = False,
     progress: Progress = SILENT,
 ) -> BagReport:
-    """Write a mission as a bag.
+    """Write a mission (row) as a bag.
 
     Stamps of images are those of their camera's clock, so that a reader with the same calibration gets
     the map's times; all others are of the IMU's clock.
 
     Args:
-        map_folder: Folder of the map, where its resources are.
-        mission: Row of the mission.
         path: File of a ROS 1 bag, or folder of a ROS 2 bag.
-        options: Parts and format.
-        overwrite: Replace a bag that exists.
 
     Raises:
         UserError: The bag cannot be written, or the mission has none of the parts.
@@ -105,10 +101,7 @@ def export_mcap(
     Landmarks, closures and paths have the time of the first vertex, so that they are there at once.
 
     Args:
-        map_folder: Folder of the map, where its images are.
         path: Folder to write; it has an .mcap of the same name.
-        images: Write the images among the resources, too.
-        overwrite: Replace a recording that exists.
 
     Raises:
         UserError: The map has no vertices, or the recording cannot be written.

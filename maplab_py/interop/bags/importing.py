@@ -174,15 +174,10 @@ def import_bag_resources(
     *,
     progress: Progress = SILENT,
 ) -> tuple[VIMap, BagImport]:
-    """Attach the images or depth images of a topic to frames, or its clouds to a sensor.
+    """Attach the images or depth images of a topic to frames, or its clouds to a sensor, of a mission (row).
 
     A frame gets the message that is nearest in time, if it is the nearest frame of that message, too.
     Images of the encodings 16UC1 (millimetres) and 32FC1 (metres) are depth maps.
-
-    Args:
-        mission: Row of the mission.
-        path: Bag.
-        options: Topic, sensor and times.
 
     Raises:
         UserError: It is no bag, a topic is missing or of another type, the calibration is of another

@@ -48,11 +48,7 @@ def add_poses_to_bag(
     frames and topics end in _0, _1, ... by the time of their beginning.
 
     Args:
-        source: Bag to copy.
-        target: Bag to write.
-        options: What is added.
         missions: Rows; None = all.
-        overwrite: Replace a bag that exists.
 
     Raises:
         UserError: The source is no bag, the target exists, or there is nothing to add.

@@ -67,7 +67,6 @@ def make_camera(
         intrinsics: Mirror parameters, fu fv cu cv.
         coefficients: Distortion parameters, as many as the file has.
         size: Width and height.
-        more: Further fields of the camera.
 
     Raises:
         MapError: A model is not supported, or a number is wrong.
@@ -194,10 +193,8 @@ def read_imu(
     """Return the IMU of an entry without id.
 
     Args:
-        entry: Entry with the noise.
         noise: Keys of the noise density and the random walk of the accelerometer, then of the gyroscope.
         limits: Keys that may be missing, by the field of the IMU.
-        more: Further fields of the IMU.
 
     Raises:
         MapError: A key is missing or not positive.

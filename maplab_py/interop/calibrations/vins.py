@@ -38,7 +38,6 @@ def read_vins(entry: yaml_entry.Entry, folder: Path) -> parts.Parts:
     """Return cameras and IMU of the settings.
 
     Args:
-        entry: Content of the file.
         folder: Files of cameras are named relative to it.
 
     Raises:

@@ -200,7 +200,6 @@ def with_features(
     Args:
         names: Name of the image of each frame (F).
         uv: Keypoints (K, 2) as the model has them.
-        database: COLMAP's database.
 
     Raises:
         UserError: There is no such file.

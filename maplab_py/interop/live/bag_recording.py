@@ -72,10 +72,7 @@ def record_bag(
     Args:
         kind: One of `TRANSPORTS`.
         path: File .bag for messages of ROS 1, folder for those of ROS 2 (mcap).
-        network: Where.
-        options: Topics and duration.
         silence_s: End when nothing has arrived for so long; 0 = never.
-        overwrite: Replace a bag that exists.
         is_to_end: Tells whether to end now, with what there is.
 
     Raises:

@@ -22,7 +22,6 @@ def open_transport(
 
     Args:
         kind: One of `TRANSPORTS`.
-        network: Where.
         is_server: Be the server of Foxglove, in place of its client.
 
     Raises:

@@ -67,10 +67,7 @@ def play_recording(
     """Publish images and IMU samples of a recording.
 
     Args:
-        recording: Folder or bag.
         kind: One of `TRANSPORTS`.
-        network: Where.
-        options: See there.
         is_to_end: Tells whether to end now.
 
     Raises:

@@ -139,7 +139,6 @@ class Inbox:
         """Wait for images of so many cameras.
 
         Args:
-            cameras: Number of cameras.
             tolerance_ns: Largest difference between the times of the images of a set.
             max_delay_s: Sets that have waited longer are left out while others come.
         """

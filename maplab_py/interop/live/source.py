@@ -78,10 +78,7 @@ class LiveRecording:
         """Wait for the topics.
 
         Args:
-            transport: Connection to the topics.
-            device: Sensors.
             source: Topics; empty = as the sensors say.
-            options: See there.
             wait_s: Wait so long for the publishers.
             tolerance_ns: Largest difference between the times of the images of a set.
             tell: Is told what the user should know while it goes on.
@@ -442,9 +439,7 @@ def image_data(
     """Return the image of a serialised message.
 
     Args:
-        data: Message.
         kind: Its type, one of `IMAGE_TYPES`.
-        camera: Camera that took it.
         name: What messages call it.
         store: Definitions of messages.
         is_ros_2: CDR, else ROS 1.

@@ -116,7 +116,6 @@ def imu_messages(times_ns: I64, accel_gyro: F64, frame: str, *, is_ros_2: bool) 
     Args:
         times_ns: Stamps (N,).
         accel_gyro: Samples (N, 6) [ax ay az gx gy gz], m/s^2 and rad/s.
-        frame: Name of the IMU's frame.
         is_ros_2: CDR, else ROS 1.
     """
     layout = MessageLayout(is_ros_2=is_ros_2)

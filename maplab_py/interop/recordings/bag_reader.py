@@ -59,8 +59,6 @@ class BagReader:
         """Name a bag; nothing is read but the beginning of its file.
 
         Args:
-            path: Bag.
-            files: Its storage files.
             metadata: What its metadata.yaml says; empty without one.
         """
         self._path, self._files, self._metadata = path, files, metadata

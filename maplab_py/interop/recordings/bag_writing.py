@@ -66,7 +66,6 @@ def format_of_path(path: Path, name: str = "") -> BagFormat:
     """Return the format of a new bag.
 
     Args:
-        path: The bag.
         name: Name of the format; empty = ROS 1 for files .bag, else ROS 2 with mcap.
 
     Raises:
@@ -185,9 +184,7 @@ def write_bag(
 
     Args:
         path: File of a ROS 1 bag, or folder of a ROS 2 bag.
-        kind: Format.
         messages: Messages in the order of their times.
-        overwrite: Replace a bag that exists.
 
     Raises:
         UserError: The library is missing, or the bag cannot be written.

@@ -88,10 +88,8 @@ class BagRecording:
 
         Args:
             path: ROS 1 bag, or file or folder of a ROS 2 bag.
-            device: Sensors.
             imu_topics: Topic of the IMU, or those of gyroscope and accelerometer; () = as the sensor says.
             camera_topics: Topic of each camera; () = as the cameras say.
-            reading: How stamps and images are read.
 
         Raises:
             UserError: The library is missing, or a topic is unknown, of another type, or not given.
@@ -417,7 +415,6 @@ class BagRecording:
         """Return the stream with the bag's name of its topic and the times of its first message.
 
         Args:
-            reader: Open bag.
             stream: Topic as it was given.
             within_ns: First and last arrival of messages that count; None = all.
         """

@@ -211,8 +211,6 @@ def check_common_time(
     """Check that the spans (first, last) of IMU and images have some time in common.
 
     Args:
-        name: Recording.
-        imu_ns: Times of the IMU.
         images_ns: Times of the images in the clock of the IMU.
         proposal: Shift of the images that would help, and why.
         is_apart: Only one of their clocks has started again, and no shift was given.

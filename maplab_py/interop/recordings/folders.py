@@ -57,9 +57,7 @@ class FolderRecording:
 
         Args:
             root: Folder with cam0.
-            device: Sensors.
             camera_folders: Number of the folder cam<number> of each camera; () = 0, 1, ...
-            reading: How stamps and images are read.
 
         Raises:
             MapError: A table is missing, empty or wrong, or names an image that is not there.

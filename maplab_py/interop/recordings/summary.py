@@ -75,7 +75,6 @@ def summarise(
     """Read a recording and report what is in it; of one whose clock starts again, its first part.
 
     Args:
-        options: Part of it, and how it is synchronised.
         check_images: Check size and completeness of all images of frame sets, without decoding.
 
     Raises:

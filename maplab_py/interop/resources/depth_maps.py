@@ -44,15 +44,13 @@ def import_depth_maps(
     *,
     progress: Progress = SILENT,
 ) -> tuple[VIMap, matching.ImportedResources]:
-    """Attach depth images (16-bit PNG, named by time stamp) to the frames of a camera.
+    """Attach depth images (16-bit PNG, named by time stamp) to the frames of a camera of a mission (row).
 
     Depths must be along the optical axis, at the pixels of the camera's distorted image.
 
     Args:
-        mission: Row of the mission.
         camera: Index of the camera in its rig.
         folder: Has the files <time stamp in ns>.png.
-        options: Scale and tolerance.
 
     Raises:
         UserError: There are no files, no such camera, or no file belongs to a frame.

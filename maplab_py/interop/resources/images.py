@@ -112,14 +112,11 @@ def export_images(
     overwrite: bool = False,
     progress: Progress = SILENT,
 ) -> matching.ExportedImages:
-    """Write the images of a mission's frames as the folders cam0, cam1, ... of an EuRoC folder.
+    """Write the images of the frames of a mission (row) as the folders cam0, cam1, ... of an EuRoC folder.
 
     Args:
-        map_folder: Folder of the map, where its resources are.
-        mission: Row of the mission.
         kind: Number of the resource type.
         folder: Gets mav0.
-        overwrite: Replace files that exist.
 
     Raises:
         UserError: The mission has no such images, or a file cannot be written.

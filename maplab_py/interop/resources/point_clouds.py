@@ -135,7 +135,6 @@ def import_point_clouds(
     mission are left out, as are those of times that the sensor has a cloud of.
 
     Args:
-        mission: Row of the mission.
         folder: Has the files <time stamp in ns>.ply or .pcd.
         sensor_id: Sensor, or an unambiguous prefix; empty = the mission's lidar.
 
@@ -193,7 +192,6 @@ def add_clouds(
 
     Args:
         new: Gets the clouds.
-        chosen: Rows (N,).
         clouds: Row, and what reads its cloud.
 
     Raises:

@@ -50,7 +50,6 @@ def read_frames(vertices: list[Any], vertex_name: Name, max_bytes: int) -> Frame
     """Return the frames of all vertices (in row order) and their keypoints.
 
     Args:
-        vertices: Messages.
         vertex_name: File and id of a vertex (row).
         max_bytes: Bound of the table of descriptors, unless at least half of it is descriptors.
 

@@ -76,7 +76,6 @@ def ids_of_field(
     """Return the ids (N, 2) in a repeated field of messages (M,), and their number (M,) in each.
 
     Args:
-        messages: Messages of one type.
         field: Name of the field.
         where: The field, for the message of an error.
         name: Gives file and id of a message.

@@ -44,8 +44,6 @@ def read_resources(
 
     Args:
         of_frames: Those of the frames (`resources_of_frames`).
-        content: Missions.
-        budget: Bound of memory.
 
     Raises:
         MapError: resource_info is damaged, or a mission's lists differ in length.

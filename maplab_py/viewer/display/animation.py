@@ -33,7 +33,6 @@ def save_animation(
 
     Args:
         viewer: Shows the map; it shows the same state afterwards.
-        path: A .gif file.
         size_px: Width and height.
         view: One of `camera.VIEWS`; empty = as the newest open page looks.
 

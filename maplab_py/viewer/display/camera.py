@@ -55,7 +55,6 @@ def view_of(
     The overview and the view from the side look across the longest direction of the map.
 
     Args:
-        extent: What to show.
         view: One of `VIEWS`.
         beside_panel: Leave the part of the page free that the panel covers.
         room: Width of the picture by that of the outline.

@@ -61,7 +61,6 @@ class Nodes:
         Only visible layers are sent; those that are hidden follow when they are shown.
 
         Args:
-            scene: What to draw.
             layers: Names of visible layers.
             missions: Ids of visible missions.
         """

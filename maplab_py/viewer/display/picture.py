@@ -53,9 +53,6 @@ def take_picture(
     for as long as it takes.
 
     Args:
-        server: The viser server.
-        url: Its address.
-        extent: What the view shall show.
         view: One of `camera.VIEWS`; empty = where the open page looks, or the overview.
         size_px: Width and height.
         is_dark: Colour of the ground.
@@ -256,10 +253,8 @@ def export_html(
 
     Args:
         server: The viser server that shows the scene.
-        scene: What it shows.
         layers: Names of the layers that are visible at first; the others have nodes that are hidden.
         chooser: HTML of the slider of states, empty = none.
-        is_dark: Theme.
 
     Raises:
         UserError: The file cannot be written.

@@ -188,7 +188,6 @@ def plot_paths(signal: Signal, vertices: I64, progress: F64) -> tuple[str, ...]:
     """Return the curves of a signal, one SVG path per component, in a box of `_WIDTH` x `_HEIGHT`.
 
     Args:
-        signal: What to plot.
         vertices: Rows (N,) of one mission, in order.
         progress: Where (N,) each of them is along the time line, in [0, 1].
     """
@@ -355,7 +354,6 @@ class TimeLine:
         Args:
             seconds: Times (N,) of all steps; the last one is the whole map.
             step: Where playback is.
-            note: Words beside the slider.
             plots: HTML of the plots; empty = the hint.
         """
         length = max(_SLIDER_STEP_S, float(np.ceil(seconds[-1] / _SLIDER_STEP_S)) * _SLIDER_STEP_S)

@@ -35,10 +35,6 @@ class Player:
         """Send the nodes of all steps, hidden.
 
         Args:
-            server: Where to draw.
-            drawing: The map.
-            missions: Ids of the missions to play.
-            options: How.
             clouds: Dense clouds, each shown from the vertex on at which it was recorded.
         """
         self._server = server

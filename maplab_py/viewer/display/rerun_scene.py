@@ -32,10 +32,8 @@ def show_in_rerun(
     """Open Rerun with a subject, or write it to a file; return its scene.
 
     Args:
-        subject: What to show.
         images: Images of its vertices, if there are any.
         file: File .rrd to write in place of opening the viewer.
-        overwrite: Replace a file that exists.
 
     Raises:
         UserError: The library is missing, the subject cannot be shown, or the file not written.

@@ -183,8 +183,6 @@ class Themes:
         """Add the button to a folder of the panel.
 
         Args:
-            viewer: Of the pages.
-            folder: Where the button is.
             is_dark: Let all pages be dark at first, whatever their systems are.
         """
         self._server = server = viewer.server

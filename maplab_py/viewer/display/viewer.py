@@ -145,7 +145,6 @@ class Viewer:
         """Show a subject now.
 
         Args:
-            subject: What to show.
             playback: How the time slider plays it.
 
         Raises:

@@ -58,8 +58,6 @@ def beside(drawing: Drawing, other: VIMap, names: tuple[str, str]) -> list[Layer
     """Return the paths and landmarks of another map in the colours of their missions, and names.
 
     Args:
-        drawing: The map as it is shown.
-        other: What is drawn beside it.
         names: What the map and the other one are called.
     """
     shift = shift_beside(drawing, other)
@@ -86,8 +84,6 @@ def reference_landmarks(
     """Return the landmarks of the other map that are not of bad quality.
 
     Args:
-        drawing: The map as it is shown.
-        other: The other map.
         shift: What takes positions of it (3,) from G to the scene.
         colour: One colour (3,), or one (M, 3) for each mission of the other map.
         is_visible: Show them at first.

@@ -35,7 +35,6 @@ def compared(drawing: Drawing, other: VIMap) -> list[Layer]:
     """Another state of the map in grey, and how far the vertices have moved since.
 
     Args:
-        drawing: The map as it is shown.
         other: The map to compare with; vertices correspond by id.
     """
     shift, grey = -drawing.origin_G, colours.REFERENCE
@@ -92,7 +91,6 @@ def position_errors(stamps_ns: I64, p: F64, truth: Trajectory) -> F64:
     Args:
         stamps_ns: Times (V,) of the vertices.
         p: Their positions (V, 3).
-        truth: The true path.
 
     Raises:
         UserError: Too few vertices have ground truth to lay it on the map.
