@@ -21,6 +21,7 @@ from maplab_py.child_processes import in_order
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3
 from maplab_py.interop import imu_csv, trajectories
+from maplab_py.interop.ply import PlyCloud, encode_ply
 from maplab_py.output_files import write_text
 from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors import Camera, Distortion, Imu, Projection
@@ -304,14 +305,7 @@ def write_mesh(surfaces: Surfaces, path: Path) -> None:
     corners[flipped] = corners[flipped, ::-1]
     first = 4 * np.arange(len(c))[:, None]
     triangles = np.concatenate([first + np.array([0, 1, 2]), first + np.array([0, 2, 3])])
-    faces = np.zeros(len(triangles), dtype=[("count", "u1"), ("corner", "<i4", 3)])
-    faces["count"], faces["corner"] = 3, triangles
-    header = (
-        "ply\nformat binary_little_endian 1.0\n"
-        f"element vertex {4 * len(c)}\nproperty float x\nproperty float y\nproperty float z\n"
-        f"element face {len(triangles)}\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    write_file(path, [header.encode(), corners.astype("<f4").tobytes(), faces.tobytes()])
+    write_file(path, encode_ply(PlyCloud(corners.reshape(-1, 3), faces=triangles)))
 
 
 TRUTH_FILE = "truth.npz"

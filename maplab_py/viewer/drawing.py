@@ -116,10 +116,8 @@ class Drawing:
 
     def by_mission(self, mission: NDArray[Any]) -> list[tuple[str, I64]]:
         """Return the mission ids that occur in (N,) mission rows, with the places of each."""
-        order = np.argsort(mission, kind="stable")
-        cuts = np.flatnonzero(np.diff(mission[order])) + 1
-        groups = np.split(order, cuts) if len(order) else []
-        return [(self.mission_ids[int(mission[places[0]])], places) for places in groups]
+        groups = rows_by_value(mission, np.arange(len(mission)))
+        return [(self.mission_ids[row], places) for row, places in groups.items()]
 
     def points(
         self, mission: NDArray[Any], p: F64, colour: U8, rows: I64, size_m: float
@@ -145,6 +143,14 @@ class Drawing:
             mission_id: make_segments(start[k], end[k], every[k], rows[k], width_px)
             for mission_id, k in self.by_mission(mission)
         }
+
+
+def rows_by_value(values: NDArray[Any], rows: I64) -> dict[int, I64]:
+    """Return the rows (N,) by their values (N,), ascending."""
+    order = np.argsort(values, kind="stable")
+    cuts = np.flatnonzero(np.diff(values[order])) + 1
+    groups = np.split(order, cuts) if len(order) else []
+    return {int(values[group[0]]): rows[group] for group in groups}
 
 
 def mission_shift(vi_map: VIMap, options: VisualizationOptions) -> F64:

@@ -3,25 +3,26 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+from typing import Any, Literal
 
 from maplab_py.algorithms.loop_closure.reports import Verdict
 from maplab_py.errors import FlagError
 from maplab_py.options import Options, option
 from maplab_py.vimap.descriptors import type_of_name
 
-COLOURINGS = (
-    "mission",
-    "height",
-    "observations",
-    "missions",
-    "quality",
-    "time",
-    "type",
-    "camera",
-    "pixels",
-    "grey",
-)
+_RULES = {
+    "height": "color_landmarks_by_height",
+    "observations": "color_landmarks_by_number_of_observations",
+    "missions": "color_landmarks_by_observer_datasets",
+    "quality": "color_landmarks_by_quality",
+    "time": "color_landmarks_by_time",
+    "type": "color_by_landmark_type",
+    "camera": "color_landmarks_by_first_observer_frame",
+    "pixels": "color_landmarks_by_pixels",
+    "mission": "color_by_mission",
+}
+"""Options of the rules that colour landmarks; a special rule beats the mission's."""
+COLOURINGS = ("mission", *(rule for rule in _RULES if rule != "mission"), "grey")
 
 MeshColouring = Literal["auto", "shaded", "colour", "height", "distance"]
 """Rules for the colours of meshes, see `mesh_sources.coloured_mesh`."""
@@ -124,35 +125,13 @@ class VisualizationOptions(Options, prefix="vis_"):
 
     @property
     def landmark_colouring(self) -> str:
-        """The rule that colours landmarks, one of `COLOURINGS`; a special rule beats the mission's."""
-        rules = (
-            (self.color_landmarks_by_height, "height"),
-            (self.color_landmarks_by_number_of_observations, "observations"),
-            (self.color_landmarks_by_observer_datasets, "missions"),
-            (self.color_landmarks_by_quality, "quality"),
-            (self.color_landmarks_by_time, "time"),
-            (self.color_by_landmark_type, "type"),
-            (self.color_landmarks_by_first_observer_frame, "camera"),
-            (self.color_landmarks_by_pixels, "pixels"),
-            (self.color_by_mission, "mission"),
-        )
-        return next((name for is_wanted, name in rules if is_wanted), "grey")
+        """The rule that colours landmarks, one of `COLOURINGS`."""
+        return next((rule for rule, name in _RULES.items() if getattr(self, name)), "grey")
 
     def with_colouring(self, colouring: str, only_missions: str = "") -> VisualizationOptions:
         """Return the options with another rule (one of `COLOURINGS`) for landmarks."""
-        return dataclasses.replace(
-            self,
-            color_only_missions=only_missions,
-            color_landmarks_by_height=colouring == "height",
-            color_landmarks_by_number_of_observations=colouring == "observations",
-            color_landmarks_by_observer_datasets=colouring == "missions",
-            color_landmarks_by_quality=colouring == "quality",
-            color_landmarks_by_time=colouring == "time",
-            color_by_landmark_type=colouring == "type",
-            color_landmarks_by_first_observer_frame=colouring == "camera",
-            color_landmarks_by_pixels=colouring == "pixels",
-            color_by_mission=colouring == "mission",
-        )
+        rules: dict[str, Any] = {name: rule == colouring for rule, name in _RULES.items()}
+        return dataclasses.replace(self, color_only_missions=only_missions, **rules)
 
 
 class PlaybackOptions(Options, prefix="vis_seq_"):

@@ -202,6 +202,17 @@ def _rows_with_prefix(ids: U64, prefix: str) -> I64:
     return np.flatnonzero(keep)
 
 
+def ends_of(drawing: Drawing, entity: Entity, row: int) -> tuple[int, ...]:
+    """Return the vertices (rows) that a closure joins; none of another entity."""
+    if entity is Entity.LOOP_CLOSURE:
+        edges = drawing.vi_map.loop_closure_edges
+        return int(edges.from_vertex[row]), int(edges.to_vertex[row])
+    if entity is Entity.CLOSURE:
+        closure = read_record(drawing.vi_map).closures.take(np.array([row]))
+        return tuple(np.concatenate(closure_ends(drawing, closure)).tolist())
+    return ()
+
+
 def _position(drawing: Drawing, entity: Entity, row: int) -> F64:
     """Return where an entity (3,) is drawn.
 
@@ -213,13 +224,7 @@ def _position(drawing: Drawing, entity: Entity, row: int) -> F64:
     elif entity is Entity.VERTEX:
         p = drawing.p_vertices[row]
     else:
-        if entity is Entity.CLOSURE:
-            closures = read_record(drawing.vi_map).closures.take(np.array([row]))
-            ends = np.concatenate(closure_ends(drawing, closures))
-        else:
-            edges = drawing.vi_map.loop_closure_edges
-            ends = np.array([edges.from_vertex[row], edges.to_vertex[row]])
-        p = drawing.p_vertices[ends].mean(axis=0)
+        p = drawing.p_vertices[list(ends_of(drawing, entity, row))].mean(axis=0)
     if not np.isfinite(p).all():
         raise UserError(f"this {entity.value} has no finite position: it cannot be shown")
     return np.asarray(p)

@@ -182,7 +182,7 @@ def vertex_signals(drawing: Drawing, truth: Trajectory | None = None) -> tuple[S
     if truth is not None:
         error_m = position_errors(drawing.vi_map.vertices.timestamp_ns, drawing.p_vertices, truth)
         signals.append(Signal("position error", "m", error_m[:, None], 3))
-    return tuple(signal for signal in signals if _is_known(signal.values))
+    return tuple(s for s in signals if np.any(np.isfinite(s.values) & (s.values != 0.0)))
 
 
 def observation_signals(vi_map: VIMap) -> tuple[F64, F64]:
@@ -209,8 +209,3 @@ def observation_signals(vi_map: VIMap) -> tuple[F64, F64]:
     total = np.bincount(vertex[seen], error_px[seen], minlength=count)
     np.divide(total, number, out=mean_px, where=number > 0)
     return mean_px, observed.astype(np.float64)
-
-
-def _is_known(values: F64) -> bool:
-    """Tell whether some value is finite and not zero."""
-    return bool(np.any(np.isfinite(values) & (values != 0.0)))

@@ -52,7 +52,8 @@ def read_vins(entry: yaml_entry.Entry, folder: Path) -> parts.Parts:
             raise MapError(f"{entry.where}: key 'num_of_cam' must be from 1 to {_MAX_CAMERAS}")
         files = [folder / str(entry.raw(f"cam{row}_calib")) for row in range(count)]
         cameras = [_camera(parts.read_entry(path)) for path in files]
-        poses = [_pose(entry, f"body_T_cam{row}") for row in range(count)]
+        keys = [f"body_T_cam{row}" for row in range(count)]
+        poses = [entry.pose(key) if key in entry else None for key in keys]
         notes += _compare_sizes(entry, cameras)
     shift_ns = models.read_time_shift_ns(entry, "td")
     topics = ("image0_topic", "image1_topic")
@@ -100,10 +101,6 @@ def _camera(entry: yaml_entry.Entry) -> Camera:
     return models.make_camera(
         entry, ("model_type", projection), ("model_type", distortion), numbers, coefficients, size
     )
-
-
-def _pose(entry: yaml_entry.Entry, key: str) -> F64 | None:
-    return entry.pose(key) if key in entry else None
 
 
 def _mono_pose(entry: yaml_entry.Entry) -> F64 | None:

@@ -93,8 +93,9 @@ class LiveRecording:
         self._imu_names = _imu_topics(device, source)
         cameras = _camera_topics(device, source)
         topics = transports.wait_for_topics(transport, [*self._imu_names, *cameras], wait_s)
-        for topic, wanted in zip(topics, self._wanted_types(), strict=True):
-            _check_type(transport, topic, wanted)
+        for row, topic in enumerate(topics):
+            is_imu = row < len(self._imu_names)
+            _check_type(transport, topic, (bags.IMU_TYPE,) if is_imu else bags.IMAGE_TYPES)
         self._camera_types = [topic.type for topic in topics[len(self._imu_names) :]]
         self._offsets_ns = [camera.time_offset_ns for camera in device.cameras]
         self.inbox = Inbox(len(cameras), tolerance_ns, options.max_delay_s)
@@ -122,12 +123,6 @@ class LiveRecording:
             sensor = row if is_imu else row - len(self._imu_names)
             take = self._take_imu if is_imu else self._take_image
             self._transport.subscribe(topic, partial(take, sensor, self.counts[topic.name]))
-
-    def _wanted_types(self) -> list[tuple[str, ...]]:
-        return [
-            *((bags.IMU_TYPE,) for _ in self._imu_names),
-            *(bags.IMAGE_TYPES for _ in self.device.cameras),
-        ]
 
     # -- in the receiving thread ------------------------------------------------------------------
 

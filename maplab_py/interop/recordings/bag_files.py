@@ -195,18 +195,12 @@ def _metadata(path: Path) -> dict[str, Any]:
 def _storages_in(folder: Path) -> list[Path]:
     """Return the storage files of a folder; a plain file hides its compressed copy."""
     files = {file.name: file for file in folder.iterdir() if _is_storage(file)}
-    kept = [
-        file for name, file in files.items() if not _is_packed(file) or Path(name).stem not in files
-    ]
-    return sorted(kept)
+    packed = (".zstd", ".zst")
+    return sorted(f for f in files.values() if f.suffix not in packed or f.stem not in files)
 
 
 def _is_storage(path: Path) -> bool:
     return path.is_file() and _STORAGE.fullmatch(path.name) is not None
-
-
-def _is_packed(path: Path) -> bool:
-    return path.suffix in (".zstd", ".zst")
 
 
 def _remedy(path: Path, reason: str) -> str:

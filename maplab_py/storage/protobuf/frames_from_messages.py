@@ -69,7 +69,10 @@ def read_frames(vertices: list[Any], vertex_name: Name, max_bytes: int) -> Frame
 
     ids = ids_of([f.id for f in frames], "id of a frame", lambda k: vertex_name(owned[k][0]))
     counts = [_checked_count(frame, place, name) for place, frame in enumerate(frames)]
-    present = [_present(frame) for frame in frames]
+    present = [
+        sum(int(bit) for bit, (name, _) in _OPTIONAL.items() if len(getattr(frame, name)))
+        for frame in frames
+    ]
     described = [_descriptors(frame, counts[k], k, name) for k, frame in enumerate(frames)]
     table = tables.Frames.filled(
         len(frames),
@@ -234,10 +237,6 @@ def _landmark_ids(frames: list[Any], counts: I32, name: Name) -> U64:
     result = np.zeros((int(counts.sum()), 2), dtype=np.uint64)
     result[np.repeat(present > 0, counts)] = ids
     return result
-
-
-def _present(frame: Any) -> int:
-    return sum(int(bit) for bit, (name, _) in _OPTIONAL.items() if len(getattr(frame, name)))
 
 
 def _with_keypoints(

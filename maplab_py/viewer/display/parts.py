@@ -84,7 +84,8 @@ class Nodes:
                 if before is None or not _moved_in_place(self._server, key, before, part):
                     if before is not None:
                         self._remove(key)
-                    self._nodes[key] = _Node(part, self._add(_node_name(*key), part))
+                    handles = add_part(self._server, _node_name(*key), part, self.point_scale)
+                    self._nodes[key] = _Node(part, handles)
         return sent
 
     @contextmanager
@@ -148,9 +149,6 @@ class Nodes:
         self._is_ground_visible = is_visible
         for handle in self._ground:
             handle.visible = is_visible
-
-    def _add(self, name: str, part: Part) -> list[Any]:
-        return add_part(self._server, name, part, self.point_scale)
 
     def _remove(self, key: _NodeKey) -> None:
         for handle in self._nodes.pop(key).handles:

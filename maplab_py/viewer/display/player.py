@@ -13,12 +13,11 @@ from maplab_py.array_types import I64
 from maplab_py.geometry import se3
 from maplab_py.viewer import colours, playback
 from maplab_py.viewer.display.parts import add_part
-from maplab_py.viewer.drawing import Drawing, make_points, make_segments, spread_rows
+from maplab_py.viewer.drawing import Drawing, make_points, make_segments, rows_by_value, spread_rows
 from maplab_py.viewer.layers import cameras, landmarks
 from maplab_py.viewer.layers.clouds import Cloud, cloud_colours, colour_ranges
 from maplab_py.viewer.options import PlaybackOptions
-
-_FRUSTUM = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
+from maplab_py.viewer.scene import Part
 
 
 class Player:
@@ -45,7 +44,8 @@ class Player:
         self._recent: list[Any] = []
         self.step = -1
         with server.atomic():
-            self._chunks = self._make_chunks()
+            self._chunks: dict[int, list[Any]] = {}  # hidden nodes by step
+            self._add_steps()
             self._add_clouds(clouds)
             self._heads = self._make_heads()
 
@@ -84,45 +84,32 @@ class Player:
     def remove(self) -> None:
         """Take all nodes away."""
         with self._server.atomic():
-            handles = [h for chunk in self._chunks.values() for h in chunk]
-            for handle in [
-                *handles,
-                *(h for hs in self._heads.values() for h in hs),
-                *self._recent,
-            ]:
-                handle.remove()
+            for handles in (*self._chunks.values(), *self._heads.values(), self._recent):
+                for handle in handles:
+                    handle.remove()
         self._chunks, self._heads, self._recent = {}, {}, []
 
-    def _make_chunks(self) -> dict[int, list[Any]]:
+    def _add_hidden(self, step: int, name: str, part: Part) -> None:
+        for handle in add_part(self._server, f"/play/{step}/{name}", part):
+            handle.visible = False
+            self._chunks.setdefault(step, []).append(handle)
+
+    def _add_steps(self) -> None:
+        """Add the piece of the paths, and the landmarks, of each step."""
         drawing, timeline = self._drawing, self.timeline
         mission = drawing.vi_map.vertices.mission
         start = np.flatnonzero((mission[1:] == mission[:-1]) & self._plays[mission[1:]])
-        paths = _group(timeline.vertex_step[start + 1], start)
+        paths = rows_by_value(timeline.vertex_step[start + 1], start)
         rows = timeline.landmarks[self._plays[drawing.landmark_mission[timeline.landmarks]]]
-        clouds = _group(timeline.landmark_step[rows], rows)
+        clouds = rows_by_value(timeline.landmark_step[rows], rows)
         every, _ = landmarks.landmark_colours(drawing)
-        chunks: dict[int, list[Any]] = {}
         p = drawing.p_vertices
         for step, members in paths.items():
-            path = make_segments(
-                p[members],
-                p[members + 1],
-                drawing.mission_colours[mission[members]],
-                members,
-                3.0,
-            )
-            chunks.setdefault(step, []).extend(add_part(self._server, f"/play/{step}/path", path))
+            colour, ends = drawing.mission_colours[mission[members]], (p[members], p[members + 1])
+            self._add_hidden(step, "path", make_segments(*ends, colour, members, 3.0))
         for step, members in clouds.items():
-            cloud = make_points(
-                drawing.p_landmarks[members], every[members], members, landmarks.point_size(drawing)
-            )
-            chunks.setdefault(step, []).extend(
-                add_part(self._server, f"/play/{step}/landmarks", cloud)
-            )
-        for chunk in chunks.values():
-            for handle in chunk:
-                handle.visible = False
-        return chunks
+            size_m, p_L = landmarks.point_size(drawing), drawing.p_landmarks[members]
+            self._add_hidden(step, "landmarks", make_points(p_L, every[members], members, size_m))
 
     def _add_clouds(self, clouds: tuple[Cloud, ...]) -> None:
         total = max(sum(len(cloud.p_G) for cloud in clouds), 1)
@@ -136,9 +123,7 @@ class Player:
             rows = spread_rows(p, max(1, limit * len(p) // total))
             size = 0.9 * self._drawing.unit_m / np.sqrt(max(min(total, limit), 1_000))
             part = make_points(p[rows], cloud_colours(cloud, ranges)[rows], rows, size)
-            for handle in add_part(self._server, f"/play/{step}/cloud_{number}", part):
-                handle.visible = False
-                self._chunks.setdefault(step, []).append(handle)
+            self._add_hidden(step, f"cloud_{number}", part)
 
     def _make_heads(self) -> dict[int, list[Any]]:
         """Make the camera, or a dot, that travels along each mission."""
@@ -150,7 +135,7 @@ class Player:
             lines = [
                 se3.transform(
                     camera.T_I_C, cameras.frustum_points(camera.camera, 0.06 * drawing.unit_m)
-                )[_FRUSTUM]
+                )[cameras.FRUSTUM_EDGES]
                 for camera in cameras.mission_cameras(drawing.vi_map, mission)
             ]
             if lines:
@@ -187,11 +172,3 @@ class Player:
             1.6 * landmarks.point_size(self._drawing),
         )
         self._recent = add_part(self._server, "/play/recent", part)
-
-
-def _group(step: I64, rows: I64) -> dict[int, I64]:
-    """Return the rows of each step."""
-    order = np.argsort(step, kind="stable")
-    cuts = np.flatnonzero(np.diff(step[order])) + 1
-    groups = np.split(order, cuts) if len(order) else []
-    return {int(step[group[0]]): rows[group] for group in groups}

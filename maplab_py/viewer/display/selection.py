@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.algorithms.landmarks.sightings import residuals
-from maplab_py.algorithms.loop_closure.closure_record import read_record
 from maplab_py.array_types import F64, I64, U8
 from maplab_py.errors import MapError, UserError
 from maplab_py.viewer import colours, resource_clouds
@@ -19,8 +18,8 @@ from maplab_py.viewer.display import panel, parts
 from maplab_py.viewer.display.camera import approach
 from maplab_py.viewer.drawing import Drawing, make_points, make_segments
 from maplab_py.viewer.facts import Facts, facts
-from maplab_py.viewer.layers import cameras, closures
-from maplab_py.viewer.picking import MIN_DIGITS, Pick, find_by_id, id_of
+from maplab_py.viewer.layers import cameras
+from maplab_py.viewer.picking import MIN_DIGITS, Pick, ends_of, find_by_id, id_of
 from maplab_py.viewer.scene import Entity, Part
 from maplab_py.vimap import VIMap, descriptors, ragged_rows
 
@@ -43,7 +42,11 @@ class _Content:
 
 
 def _content(drawing: Drawing, picked: Pick) -> _Content:
-    vi_map, images, ends = drawing.vi_map, drawing.images, _closure_ends(drawing, picked)
+    vi_map, images, ends = (
+        drawing.vi_map,
+        drawing.images,
+        ends_of(drawing, picked.entity, picked.row),
+    )
     image, note = None, ""
     if picked.entity is Entity.VERTEX:
         image = images(picked.row)
@@ -52,16 +55,6 @@ def _content(drawing: Drawing, picked: Pick) -> _Content:
     elif ends and isinstance(images, resource_clouds.VertexImages):
         image, note = closure_picture(vi_map, images, *ends) or (None, "")
     return _Content(facts(vi_map, picked.entity, picked.row), image, note, ends)
-
-
-def _closure_ends(drawing: Drawing, picked: Pick) -> tuple[int, ...]:
-    if picked.entity is Entity.LOOP_CLOSURE:
-        edges = drawing.vi_map.loop_closure_edges
-        return int(edges.from_vertex[picked.row]), int(edges.to_vertex[picked.row])
-    if picked.entity is Entity.CLOSURE:
-        closure = read_record(drawing.vi_map).closures.take(np.array([picked.row]))
-        return tuple(np.concatenate(closures.closure_ends(drawing, closure)).tolist())
-    return ()
 
 
 class _Widgets:

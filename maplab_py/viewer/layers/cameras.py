@@ -14,7 +14,7 @@ from maplab_py.viewer.scene import WHOLE_MAP, Axes, Layer, Part
 from maplab_py.vimap import MissionSensor, VIMap, mission_sensor_id
 
 _FRUSTA_PER_MISSION = 250
-_EDGES = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
+FRUSTUM_EDGES = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
 """Lines of a frustum: point 0 is the centre, points 1 to 4 go round the image."""
 
 
@@ -73,7 +73,7 @@ def frusta(drawing: Drawing) -> Layer:
         ends = np.concatenate(
             [frustum_lines(drawing, rows, c, 0.02 * drawing.unit_m) for c in cameras]
         )
-        owners = np.repeat(np.tile(rows, len(cameras)), len(_EDGES))
+        owners = np.repeat(np.tile(rows, len(cameras)), len(FRUSTUM_EDGES))
         parts[mission_id] = make_segments(ends[:, 0], ends[:, 1], colour, owners, 1.0)
     return Layer("frusta", "Cameras", parts, len(vi_map.frames), is_visible=False)
 
@@ -84,7 +84,7 @@ def frustum_lines(drawing: Drawing, vertices: I64, camera: MountedCamera, depth_
     T[:, 4:] = drawing.p_vertices[vertices]
     corners = frustum_points(camera.camera, depth_m)
     p = se3.transform(se3.compose(T, camera.T_I_C)[:, None], corners[None])
-    return np.asarray(p[:, _EDGES].reshape(-1, 2, 3))
+    return np.asarray(p[:, FRUSTUM_EDGES].reshape(-1, 2, 3))
 
 
 def observer_rays(drawing: Drawing, landmark: int) -> tuple[F64, F64, I64]:
