@@ -115,8 +115,7 @@ def _visible(
         mover = world.objects[number - 1] if number else None
         for first in range(0, len(poses.time_s), _FRAMES_AT_ONCE):
             frames = slice(first, first + _FRAMES_AT_ONCE)
-            eyes, reach_m = poses.T_G_C[frames, 4:], options.max_distance_m
-            low, high = eyes.min(axis=0) - reach_m, eyes.max(axis=0) + reach_m
+            low, high = _reach(poses.T_G_C[frames, 4:], options.max_distance_m)
             near = rows
             if mover is None:
                 near = rows[np.all((world.p_G[rows] > low) & (world.p_G[rows] < high), axis=1)]
@@ -142,6 +141,11 @@ def _visible(
     )
     order = np.lexsort((point, frame))
     return frame[order], point[order], uv[order], view[order], distance[order]
+
+
+def _reach(eyes: F64, distance_m: float) -> tuple[F64, F64]:
+    """Return the lower and upper corner of the box that lines of sight from eyes (F, 3) stay in."""
+    return eyes.min(axis=0) - distance_m, eyes.max(axis=0) + distance_m
 
 
 def _seen(
