@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 
 from maplab_py.errors import UserError
 from maplab_py.interop.live import options, transport
-from maplab_py.interop.recordings.bag_files import message_types
+from maplab_py.interop.recordings.bag_files import full_type, message_types
 
 SUBPROTOCOLS: Any = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 """Those of foxglove_bridge from 3.0 on, and before."""
@@ -238,7 +238,7 @@ class FoxgloveClient:
 
 def _channel(entry: dict[str, Any]) -> _Channel:
     """Return a channel as the server announces it; schemas of ROS 1 have names of two parts."""
-    kind = transport.ros2_type(str(entry["schemaName"]))
+    kind = full_type(str(entry["schemaName"]))
     return _Channel(int(entry["id"]), str(entry["topic"]), str(entry["encoding"]), kind)
 
 

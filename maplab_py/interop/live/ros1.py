@@ -19,7 +19,7 @@ from xmlrpc.server import SimpleXMLRPCServer
 from maplab_py.errors import MaplabError, UserError
 from maplab_py.interop.live import transport as transports
 from maplab_py.interop.live.options import NetworkOptions
-from maplab_py.interop.recordings.bag_files import message_types
+from maplab_py.interop.recordings.bag_files import full_type, message_types
 
 # Source: wiki.ros.org, "ROS/TCPROS", "ROS/Connection Header"
 
@@ -141,7 +141,7 @@ class Ros1:
         types = dict(self._ask("getTopicTypes"))
         publishers = dict(self._ask("getSystemState")[0])
         return {
-            name: transports.Topic(name, transports.ros2_type(types[name]), len(nodes))
+            name: transports.Topic(name, full_type(types[name]), len(nodes))
             for name, nodes in sorted(publishers.items())
             if name in types and set(nodes) != {self._node}
         }

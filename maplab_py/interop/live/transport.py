@@ -98,12 +98,6 @@ def topic_of(name: str) -> str:
     return f"/{name.strip().strip('/')}"
 
 
-def ros2_type(kind: str) -> str:
-    """Return sensor_msgs/msg/Image for sensor_msgs/Image of ROS 1; another name as it is."""
-    package, _, name = kind.partition("/")
-    return f"{package}/msg/{name}" if kind.count("/") == 1 else kind
-
-
 def answer_of(ask: Callable[[], _T], wait_s: float) -> _T:
     """Ask until there is an answer; a robot may start later than this program.
 

@@ -28,6 +28,7 @@ from rosbags.typesys.store import Typestore
 
 from maplab_py.atomic import replaced_file
 from maplab_py.errors import MapError
+from maplab_py.interop.recordings.bag_files import full_type
 from maplab_py.interop.recordings.bag_layouts import storage_kind
 
 if sys.version_info >= (3, 14):
@@ -229,12 +230,6 @@ def message_types(*, is_ros_2: bool) -> Typestore:
     if tf not in store.types:
         store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", tf))
     return store
-
-
-def full_type(name: str) -> str:
-    """Return the name of a message type as package/msg/Name; old files of ROS 2 write package/Name."""
-    package, _, rest = name.partition("/")
-    return name if not rest or "/" in rest else f"{package}/msg/{rest}"
 
 
 def _digests(metadata: Mapping[str, Any]) -> dict[str, str]:

@@ -50,10 +50,12 @@ class Viewer:
 
     Attributes:
         lock: Held while a page is served.
+        server: The viser server.
         scene: What is shown.
         subject: What it was made of.
         selections: What each page has selected.
         show_image: Shows an image (H, W, 3) in the panel.
+        playback: The time line, and what it plays.
         court: Where closures are judged.
         motion: Asks for the motion that a calibration lacks.
         links: Makes and opens links to a view.
@@ -70,15 +72,15 @@ class Viewer:
             UserError: No port is free.
         """
         self.lock = threading.RLock()
-        self._server = start_server(port, self._go)
-        self._cameras = Cameras(self._server)
-        self._nodes = Nodes(self._server)
+        self.server = start_server(port, self._go)
+        self._cameras = Cameras(self.server)
+        self._nodes = Nodes(self.server)
         self._panel = Panel(self)
         self.selections = Selections(self, self._panel.selection)
         self.show_image = self.selections.show_image
         self._choices: dict[str, bool] = {}  # layers that the user has switched
         self._hidden: set[str] = set()  # ids of missions that the user has hidden
-        self._playback = Playback(self)
+        self.playback = Playback(self)
         self._time_machine = TimeMachine(self)
         self.court = Court(self)
         self.motion = MotionRequest(self)
@@ -94,7 +96,7 @@ class Viewer:
         self._idle.set()
         self._is_stopped = False
         self._next_live = 0.0
-        self._server.scene.on_click()(self.by_user(self._click))
+        self.server.scene.on_click()(self.by_user(self._click))
         self._worker = threading.Thread(target=self._work, name="maplab viewer", daemon=True)
         self._worker.start()
         atexit.register(self.stop)
@@ -110,14 +112,9 @@ class Viewer:
     # -- what the console does --------------------------------------------------------------------
 
     @property
-    def server(self) -> Any:
-        """The viser server."""
-        return self._server
-
-    @property
     def port(self) -> int:
         """The port that is served, which need not be the one asked for."""
-        return int(self._server.get_port())
+        return int(self.server.get_port())
 
     @property
     def url(self) -> str:
@@ -127,7 +124,7 @@ class Viewer:
     @property
     def is_dark(self) -> bool:
         """Tell the theme of the newest page."""
-        pages = sorted(self._server.get_clients().items())
+        pages = sorted(self.server.get_clients().items())
         return self._themes.is_dark(pages[-1][1] if pages else None)
 
     @property
@@ -139,7 +136,7 @@ class Viewer:
     @property
     def pages(self) -> int:
         """The number of open pages."""
-        return len(self._server.get_clients())
+        return len(self.server.get_clients())
 
     def show(self, subject: Subject, *, playback: PlaybackOptions | None = None) -> Scene:
         """Show a subject now.
@@ -153,7 +150,7 @@ class Viewer:
         drawing = make_checked_drawing(subject)
         scene = scene_of(drawing, subject)
         with self.lock:
-            self._playback.configure(playback or PlaybackOptions())
+            self.playback.configure(playback or PlaybackOptions())
             self._choices = {}
             self._show(subject, drawing, scene)
         self._wake.set()  # measures the history
@@ -216,7 +213,7 @@ class Viewer:
         pages = self.pages
         view = view or ("" if pages else "overview")
         picture = take_picture(
-            self._server, self.url, scene.extent, view, size_px, is_dark=self.is_dark
+            self.server, self.url, scene.extent, view, size_px, is_dark=self.is_dark
         )
         save_picture(picture, path)
         return pages
@@ -232,7 +229,7 @@ class Viewer:
         layers = self.visible_layers
         with self.lock, self._nodes.with_hidden(self._draw(scene), layers, self.visible_missions):
             try:
-                server, is_dark = self._server, self.is_dark
+                server, is_dark = self.server, self.is_dark
                 with states_to_choose(server, self.drawing, self.subject) as chooser:
                     return export_html(server, scene, layers, path, chooser, is_dark=is_dark)
             finally:
@@ -251,10 +248,10 @@ class Viewer:
                 return
             self._is_stopped = True
             self._time_machine.stop()
-        self._playback.end()
+        self.playback.end()
         self._wake.set()
         self._idle.set()
-        self._server.stop()
+        self.server.stop()
 
     @property
     def is_stopped(self) -> bool:
@@ -311,7 +308,7 @@ class Viewer:
         """Show these missions and no others."""
         with self.lock:
             self._hidden = {mission.id for mission in self._shown().missions} - visible
-            self._playback.stop()
+            self.playback.stop()
             self.redraw()
 
     def set_colouring(self, colouring: str, only_mission: str = "") -> None:
@@ -364,27 +361,22 @@ class Viewer:
     @property
     def player(self) -> Player | None:
         """Playback; None while the whole map is shown."""
-        return self._playback.player
+        return self.playback.player
 
     def set_step(self, step: int) -> None:
         """Show the map as it was after a step; the last step is the whole map."""
         with self.lock:
-            self._playback.set_step(step)
+            self.playback.set_step(step)
 
     def set_playing(self, is_playing: bool) -> None:
         """Play or pause; playing from the end starts again at the beginning."""
         with self.lock:
-            self._playback.set_playing(is_playing)
-
-    @property
-    def playback(self) -> Playback:
-        """The time line, and what it plays."""
-        return self._playback
+            self.playback.set_playing(is_playing)
 
     def open_time_line(self) -> None:
         """Open the window of the time line."""
         with self.lock:
-            self._playback.time_line.open()
+            self.playback.time_line.open()
 
     # -- picking ----------------------------------------------------------------------------------
 
@@ -401,7 +393,7 @@ class Viewer:
         """
         with self.lock:
             picked = self.selections.jump(self.drawing, text)
-            for page in self._server.get_clients().values():
+            for page in self.server.get_clients().values():
                 fly(page, self.drawing, picked)
 
     def _go(self, id_: str) -> str:
@@ -460,7 +452,7 @@ class Viewer:
         self.subject, self.scene, self._drawing = subject, scene, drawing
         if is_new_map:
             self.selections.clear()
-        self._playback.stop()
+        self.playback.stop()
         if is_new_place:
             self._nodes.show_ground(ground.make_ground(scene.extent, scene.origin_G))
         if is_other_map:
