@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -144,29 +144,19 @@ def _load(
     """Return the map, the number of its files and their unpacked bytes, and notes."""
     files = map_files.listed_files(folder, budget.max_bytes)
     checksums.verify(folder, listed)
+    sensors_file = folder / map_files.VI_MAP_FOLDER / map_files.SENSORS
     with message_numbers.accept_bad_numbers() if repair else contextlib.nullcontext():
-        return _loaded(folder, files, budget, repair, progress)
-
-
-def _loaded(
-    folder: Path,
-    files: Sequence[tuple[map_files.FileKind, Path]],
-    budget: MemoryBudget,
-    repair: bool,
-    progress: Progress,
-) -> tuple[VIMap, int, int, list[str]]:
-    parts = _read_files(files, budget, progress, in_processes=not repair)
-    load_checks.check_empty_files(parts.facts)
-    sensors = read_sensors(folder / map_files.VI_MAP_FOLDER / map_files.SENSORS, budget.max_bytes)
-    content = parts.content()
-    load_checks.check_records(content, budget.max_bytes)
-    vi_map, notes = _assemble(folder, content, parts.vertices, repair, budget)
-    vi_map = vi_map.replace(sensors=sensors)
-    vi_map = with_names(vi_map, folder)
-    if repair:
-        vi_map, dropped = without_bad_numbers(vi_map)
-        notes += dropped
-    notes += load_checks.absent_parts(folder, vi_map) + load_checks.consistency_notes(vi_map)
+        parts = _read_files(files, budget, progress, in_processes=not repair)
+        load_checks.check_empty_files(parts.facts)
+        sensors = read_sensors(sensors_file, budget.max_bytes)
+        content = parts.content()
+        load_checks.check_records(content, budget.max_bytes)
+        vi_map, notes = _assemble(folder, content, parts.vertices, repair, budget)
+        vi_map = with_names(vi_map.replace(sensors=sensors), folder)
+        if repair:
+            vi_map, dropped = without_bad_numbers(vi_map)
+            notes += dropped
+        notes += load_checks.absent_parts(folder, vi_map) + load_checks.consistency_notes(vi_map)
     progress.step(1, 1, "read files")
     return vi_map, len(files), parts.unpacked_bytes, notes
 
@@ -189,11 +179,11 @@ def _read_files(
         here = [
             path for kind, path in files if ahead is None or kind is not map_files.FileKind.VERTICES
         ]
-        with read_ahead(here, budget.max_bytes) as contents:
+        with contextlib.closing(_read_ahead(here, budget.max_bytes)) as contents:
             for index, (kind, path) in enumerate(files):
                 progress.step(index, len(files) + 1, "read files")
                 if ahead is None or kind is not map_files.FileKind.VERTICES:
-                    parts.read(kind, path, contents.take(), budget)
+                    parts.read(kind, path, next(contents), budget)
                     continue
                 part = ahead.take(path)
                 if part is None:
@@ -371,44 +361,25 @@ def _check_landmark_index(
     return [f"{wrong} entries of the landmark index repaired"]
 
 
-# Read and unpack files in another thread, one ahead of the file that is being converted.
-#
-# Reading and unpacking release Python's lock, so they take place beside the conversion. With more
-# files ahead there would only be more bytes in memory.
+def _read_ahead(paths: Sequence[Path], max_bytes: int) -> Generator[bytes | bytearray, None, None]:
+    """Yield the unpacked contents of files; another thread reads one ahead.
 
+    Reading and unpacking release Python's lock, so they take place beside the conversion. With more
+    files ahead there would only be more bytes in memory.
 
-class FilesAhead:
-    """The unpacked contents of files, in their order."""
-
-    def __init__(self, pool: ThreadPoolExecutor, paths: Sequence[Path], max_bytes: int) -> None:
-        """Start with the first file."""
-        self._pool, self._max_bytes = pool, max_bytes
-        self._left = iter(paths)
-        self._next = self._start()
-
-    def take(self) -> bytes | bytearray:
-        """Return the next content and start with the one after it.
-
-        Raises:
-            MapError: The file cannot be read; see `map_files.read_unpacked`.
-            MemoryError: The file, or the thread that reads the next one, does not fit into memory.
-        """
-        content = self._next.result()
-        self._next = self._start()
-        return content
-
-    def _start(self) -> Future[bytes | bytearray]:
-        path = next(self._left, None)
-        if path is None:
-            return Future()
-        try:
-            return self._pool.submit(map_files.read_unpacked, path, self._max_bytes)
-        except RuntimeError as error:  # there is no space for the stack of the thread
-            raise MemoryError(str(error)) from error
-
-
-@contextlib.contextmanager
-def read_ahead(paths: Sequence[Path], max_bytes: int) -> Iterator[FilesAhead]:
-    """Yield the contents of files; none may unpack to more than a bound."""
+    Raises:
+        MapError: A file cannot be read, or unpacks to more than the bound; see `read_unpacked`.
+        MemoryError: A file, or the thread that reads it, does not fit into memory.
+    """
+    waiting: Future[bytes | bytearray] | None = None
     with ThreadPoolExecutor(1) as pool:
-        yield FilesAhead(pool, paths, max_bytes)
+        for path in paths:
+            last = waiting
+            try:
+                waiting = pool.submit(map_files.read_unpacked, path, max_bytes)
+            except RuntimeError as error:  # there is no space for the stack of the thread
+                raise MemoryError(str(error)) from error
+            if last is not None:
+                yield last.result()
+        if waiting is not None:
+            yield waiting.result()

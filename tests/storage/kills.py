@@ -61,7 +61,7 @@ def state(folder: Path, old: Contents, new: Contents) -> str:
     held = [name for name, wanted in (("old", old), ("new", new)) if wanted.keys() == set(ids)]
     if not held:
         return f"{len(ids)} resources, neither those of the old nor of the new map"
-    store = ResourceStore(loaded, folder, max_bytes=0)
+    store = ResourceStore(loaded, folder)
     for row, name in enumerate(ids):
         if not np.array_equal(store.load(row), image(new[name])):
             return f"resource {name} has another content"

@@ -220,18 +220,22 @@ def contents(vi_map: VIMap, folder: Path) -> list[bytes]:
     return [resource_store.resource_path(vi_map, row, folder).read_bytes() for row in range(COUNT)]
 
 
-def test_store_loads_and_stays_within_its_bound(folder: Path) -> None:
+def test_store_loads_and_stays_within_its_bound(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cache = resource_store.ResourceCache(max_bytes=13)
+    monkeypatch.setattr(resource_store, "SHARED_CACHE", cache)
     vi_map, _ = load_map(folder)
     assert sorted(vi_map.resources.type) == [0, 11, 11, 11]
     rows = {int(vi_map.resources.type[row]): row for row in range(COUNT)}
-    store = resource_store.ResourceStore(vi_map, folder, max_bytes=13)
+    store = resource_store.ResourceStore(vi_map, folder)
     np.testing.assert_array_equal(store.load(rows[0]), [[0, 1, 2], [3, 4, 5]])
     texts = [row for row in range(COUNT) if row != rows[0]]
     assert sorted(store.load(row) for row in texts) == ["text 0", "text 1", "text 2"]
     store.load(texts[-1])
-    assert store.statistics.hits == 1
-    assert store.statistics.misses == 4
-    assert store.statistics.bytes <= 13
+    statistics = cache.statistics()
+    assert (statistics.hits, statistics.misses) == (1, 4)
+    assert statistics.bytes <= 13
     resource_store.resource_path(vi_map, texts[0], folder).unlink()
     with pytest.raises(MapError, match="cannot be read"):
         resource_store.ResourceStore(vi_map, folder).load(texts[0])

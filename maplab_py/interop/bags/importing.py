@@ -23,7 +23,6 @@ from maplab_py.interop.resources.images import RAW_COLOUR, RAW_GREY, add_image
 from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors import Camera, Distortion, Projection, projection
 from maplab_py.storage.resources.new import NewResources
-from maplab_py.storage.resources.types import resource_type
 from maplab_py.vimap import ResourceOwner, VIMap, from_hex, mission_labels, mission_time_spans_ns
 
 if TYPE_CHECKING:
@@ -284,7 +283,7 @@ def _import_images(
         topic=topic.topic,
         type=topic.type,
         messages=len(topic.stamps_ns),
-        resource_types=_types_of(new),
+        resource_types=new.type_names,
         attached=len(owners),
         had_some=len(frames) - len(wanted),
         frames_without_message=len(wanted) - len(owners),
@@ -411,13 +410,9 @@ def _import_clouds(
         topic=topic.topic,
         type=topic.type,
         messages=len(topic.stamps_ns),
-        resource_types=_types_of(new),
+        resource_types=new.type_names,
         attached=len(chosen),
         had_some=int(np.count_nonzero(inside)) - len(chosen) - empty,
         messages_outside_mission=int(np.count_nonzero(~inside)),
         notes=point_clouds.empty_clouds_note(empty),
     )
-
-
-def _types_of(new: NewResources) -> tuple[str, ...]:
-    return tuple(sorted({resource_type(new.type_of(row)).name for row in range(len(new))}))

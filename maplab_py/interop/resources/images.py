@@ -82,9 +82,9 @@ def import_images(
             f"{options.image_tolerance_ms:g} of a frame of the mission"
         )
     attached = new.attached(vi_map, rows, owners) if rows else vi_map
-    kinds = sorted({resource_type(new.type_of(row)).name for row in rows})
+    mission_id = to_hex(vi_map.missions.id[mission])
     report = matching.ImportedResources(
-        to_hex(vi_map.missions.id[mission]), tuple(kinds), len(images), len(rows), skipped, without
+        mission_id, new.type_names, len(images), len(rows), skipped, without
     )
     return attached, report
 

@@ -22,7 +22,6 @@ from maplab_py.progress import SILENT, Progress
 from maplab_py.report import counted
 from maplab_py.sensors import CameraRig
 from maplab_py.storage.resources.new import NewResources
-from maplab_py.storage.resources.types import resource_type
 from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap, from_hex, queries, to_hex
 
 # Source: The PCD file format, documentation of PCL, version 0.7.
@@ -165,7 +164,6 @@ def import_point_clouds(
             sensor_id=from_hex(sensor),
             timestamp_ns=times[chosen],
         )
-    kinds = sorted({resource_type(new.type_of(row)).name for row in range(len(new))})
     outside = int(np.count_nonzero(~inside))
     notes: tuple[str, ...] = ()
     if outside:
@@ -174,7 +172,7 @@ def import_point_clouds(
     mission_id = to_hex(vi_map.missions.id[mission])
     return vi_map, ImportedResources(
         mission_id,
-        tuple(kinds),
+        new.type_names,
         len(files),
         len(chosen),
         len(files) - outside - len(chosen) - empty,

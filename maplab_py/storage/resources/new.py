@@ -15,7 +15,7 @@ from maplab_py.array_types import U8
 from maplab_py.atomic import replaced_file
 from maplab_py.atomic.files import make_folders, remove_folders
 from maplab_py.cancellation import check_cancelled, cleaned_up, lasting_effect, provisional_effects
-from maplab_py.storage.resources.store import MAP_FOLDER, path_in_folder
+from maplab_py.storage.resources.store import MAP_FOLDER, relative_path
 from maplab_py.storage.resources.types import resource_type
 from maplab_py.vimap import IdArray, ResourceOwner, Resources, VIMap, staged_folder, to_hex
 
@@ -51,9 +51,10 @@ class NewResources:
     def __len__(self) -> int:
         return len(self._ids)
 
-    def type_of(self, row: int) -> int:
-        """Return the type (number) of a resource that was added."""
-        return self._types[row]
+    @property
+    def type_names(self) -> tuple[str, ...]:
+        """Names of the types of the resources that were added, sorted."""
+        return tuple(sorted({resource_type(kind).name for kind in self._types}))
 
     def add(self, kind: int, content: bytes) -> int:
         """Write a file of a resource type (number); return its row for `attached`.
@@ -165,7 +166,7 @@ def with_staged_in_place(vi_map: VIMap) -> SavedResources:
     for index, name in enumerate(folders):
         if name in staged:
             for row in np.flatnonzero(table.folder == index).tolist():
-                relative = path_in_folder(table, row)
+                relative = relative_path(vi_map, row)
                 files[Path(used) / relative if used else relative] = Path(name) / relative
     copied = tuple((source, copy) for copy, source in sorted(files.items()))
     known = np.array([*place, MAP_FOLDER], dtype=np.int32)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from maplab_py.atomic import replaced_file
 from maplab_py.errors import MapError, os_errors_as
 from maplab_py.storage.resources.types import resource_type
-from maplab_py.vimap import Resources, VIMap, to_hex
+from maplab_py.vimap import VIMap, to_hex
 
 MAP_FOLDER = -1
 _IMAGE_SUFFIXES = (".pgm", ".ppm")
@@ -43,32 +43,17 @@ def resource_path(vi_map: VIMap, row: int, map_folder: Path) -> Path:
 
 def relative_path(vi_map: VIMap, row: int) -> Path:
     """Return <type name>/<id><suffix> of a resource (row)."""
-    return path_in_folder(vi_map.resources, row)
-
-
-def path_in_folder(table: Resources, row: int) -> Path:
-    """Return <type name>/<id><suffix> of a row of a table of resources."""
+    table = vi_map.resources
     kind = resource_type(int(table.type[row]))
     return Path(kind.name) / f"{to_hex(table.id[row])}{kind.suffix}"
 
 
 class ResourceStore:
-    """Loads resources of a map on demand and caches the most recently used ones."""
+    """Loads resources of a map on demand; the cache of the process keeps those used last."""
 
-    def __init__(self, vi_map: VIMap, map_folder: Path, *, max_bytes: int | None = None) -> None:
-        """Serve the resources of a map that was loaded from `map_folder`.
-
-        Args:
-            map_folder: Its folder.
-            max_bytes: Size of a cache of its own; None = the cache of the process.
-        """
+    def __init__(self, vi_map: VIMap, map_folder: Path) -> None:
+        """Serve the resources of a map that was loaded from `map_folder`."""
         self._map, self._folder = vi_map, Path(map_folder)
-        self._cache = SHARED_CACHE if max_bytes is None else ResourceCache(max_bytes)
-
-    @property
-    def statistics(self) -> CacheStatistics:
-        """Hits, misses and size of the cache."""
-        return self._cache.statistics()
 
     def load(self, row: int) -> Any:
         """Return a resource: an image (H, W[, 3] BGR), a text, or the file's bytes.
@@ -77,7 +62,7 @@ class ResourceStore:
             MapError: The file is missing or cannot be decoded.
         """
         path = resource_path(self._map, row, self._folder)
-        return self._cache.load(path, int(self._map.resources.type[row]), _read)
+        return SHARED_CACHE.load(path, int(self._map.resources.type[row]), _read)
 
 
 def _read(path: Path) -> tuple[Any, int]:

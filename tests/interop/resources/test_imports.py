@@ -75,7 +75,7 @@ def test_linked_images_stay_links(room: StereoRoom, vi_map: VIMap, tmp_path: Pat
     paths = [resource_path(loaded, row, tmp_path / "map") for row in range(len(loaded.resources))]
     assert all(path.is_symlink() for path in paths)
     expected = recorded_image(room, loaded, int(loaded.resources.owner[0]))
-    image = ResourceStore(loaded, tmp_path / "map", max_bytes=0).load(0)
+    image = ResourceStore(loaded, tmp_path / "map").load(0)
     np.testing.assert_array_equal(image, expected)
     save_map(loaded, tmp_path / "map", overwrite=True)
     assert paths[0].is_symlink()
