@@ -97,12 +97,6 @@ def check_bag(path: Path, flag: str) -> None:
         )
 
 
-def full_type(name: str) -> str:
-    """Return the name of a message type as package/msg/Name; ROS 1 writes package/Name."""
-    package, _, rest = name.partition("/")
-    return name if not rest or "/" in rest else f"{package}/msg/{rest}"
-
-
 def message_types(*, is_ros_2: bool) -> Typestore:
     """Return the standard messages of ROS 2 Humble or ROS 1 Noetic, tf2_msgs included.
 

@@ -22,6 +22,12 @@ _UNKNOWN = -1.0
 """First entry of a covariance whose quantity is not measured (sensor_msgs/Imu)."""
 
 
+def full_type(name: str) -> str:
+    """Return the name of a message type as package/msg/Name; ROS 1 writes package/Name."""
+    package, _, rest = name.partition("/")
+    return name if not rest or "/" in rest else f"{package}/msg/{rest}"
+
+
 def storage_kind(path: Path) -> str:
     """Return ros1, sqlite3 or mcap: the kind of a bag's file by its first bytes, else by its name."""
     with path.open("rb") as stream:
