@@ -136,26 +136,27 @@ def check_creatable(path: Path) -> None:
         raise UserError(f"{path}: cannot be written (no permission to write into {above})")
 
 
-def check_writable(path: Path, *, overwrite: bool) -> None:
-    """Refuse a file that exists, before any work is done.
+def check_writable(*paths: Path | None, overwrite: bool) -> None:
+    """Refuse files that exist, before any work is done; None is no file.
 
     Raises:
-        UserError: The file exists and `overwrite` is not set, it is a folder, a device, a socket
+        UserError: A file exists and `overwrite` is not set, it is a folder, a device, a socket
             or a pipe, or no file can be made there.
     """
-    try:
-        mode = path.stat().st_mode
-    except (FileNotFoundError, NotADirectoryError):
-        check_creatable(path)
-        return
-    except OSError as error:
-        raise UserError(f"{path}: cannot be written ({error.strerror})") from error
-    if stat.S_ISDIR(mode):
-        raise UserError(f"{path} is a folder: name a file")
-    if not stat.S_ISREG(mode):
-        raise UserError(f"{path} is neither a file nor a folder: name a file")
-    if not overwrite:
-        raise UserError(f"{path} exists already: give --overwrite to replace it")
+    for path in filter(None, paths):
+        try:
+            mode = path.stat().st_mode
+        except (FileNotFoundError, NotADirectoryError):
+            check_creatable(path)
+            continue
+        except OSError as error:
+            raise UserError(f"{path}: cannot be written ({error.strerror})") from error
+        if stat.S_ISDIR(mode):
+            raise UserError(f"{path} is a folder: name a file")
+        if not stat.S_ISREG(mode):
+            raise UserError(f"{path} is neither a file nor a folder: name a file")
+        if not overwrite:
+            raise UserError(f"{path} exists already: give --overwrite to replace it")
 
 
 def copy_file(source: Path, target: Path, *, overwrite: bool = False) -> None:

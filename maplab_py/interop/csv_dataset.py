@@ -140,8 +140,7 @@ def export_csv_dataset(
             len(part.landmarks),
             len(part.observations),
         ]
-    for path, _ in targets:
-        check_writable(path, overwrite=overwrite)
+    check_writable(*(path for path, _ in targets), overwrite=overwrite)
     for done, (path, chunks) in enumerate(targets):
         progress.check()
         progress.step(done, len(targets), path.name)

@@ -198,8 +198,7 @@ def export_ncamera_calibration(
     if not rigs:
         raise UserError("the map has no camera rig whose calibration could be written")
     paths = tuple(folder / f"ncamera-{rig.id}.yaml" for rig in rigs)
-    for path in paths:
-        check_writable(path, overwrite=overwrite)
+    check_writable(*paths, overwrite=overwrite)
     for path, rig in zip(paths, rigs, strict=True):
         write_text(path, [yaml_text.dump_yaml(sensors_yaml.sensor_entry(rig))], overwrite=overwrite)
     return WrittenFiles(paths, len(paths))
@@ -297,8 +296,7 @@ def check_recording(
     from maplab_py.output_files import check_writable, write_text
     from maplab_py.sensors.sensors_yaml import write_sensors
 
-    if apply is not None:
-        check_writable(apply, overwrite=overwrite)
+    check_writable(apply, overwrite=overwrite)
     opened = open_recording(recording, source)
     diagnosis = doctor.diagnose(opened, stream, progress=context.progress)
     checked = doctor.report(diagnosis, opened)

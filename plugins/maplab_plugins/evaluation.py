@@ -114,8 +114,7 @@ def compare_maps(
     """
     other = map_of_key_or_folder(context, other_map)
     files = [change_meshes / f"{kind}.ply" for kind in _CHANGED] if change_meshes else []
-    for file in files:
-        check_writable(file, overwrite=overwrite)
+    check_writable(*files, overwrite=overwrite)
     if files and not changes:
         raise UserError("--change_meshes wants --changes")
     if changes:

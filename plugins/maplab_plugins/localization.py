@@ -91,9 +91,7 @@ def localize(
         raise UserError(f"--sequence_length={sequence_length}: at least 1")
     if ground_truth is not None and truth is not None:
         raise UserError("give --ground_truth or --truth, not both")
-    for path in (localization_csv, localization_json):
-        if path is not None:
-            check_writable(path, overwrite=overwrite)
+    check_writable(localization_csv, localization_json, overwrite=overwrite)
     query = context.vi_map
     missions = chosen.rows(context.vi_map)
     database, searched = _database(context, localization_map, missions, features, size)

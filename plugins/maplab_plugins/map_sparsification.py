@@ -46,8 +46,7 @@ def landmark_sparsify(
 
     if num_landmarks_to_keep <= 0:
         raise UserError(f"--num_landmarks_to_keep={num_landmarks_to_keep}: wants a number above 0")
-    if coverage_csv is not None:
-        check_writable(coverage_csv, overwrite=overwrite)
+    check_writable(coverage_csv, overwrite=overwrite)
     result, report, coverage = sparsify(
         context.vi_map, num_landmarks_to_keep, options, progress=context.progress
     )

@@ -256,9 +256,8 @@ def _check_output(context: CommandContext, run: RunOptions) -> None:
     if folder is not None:
         check_target(folder, overwrite=output.overwrite_existing_map, flag="overwrite_existing_map")
         check_parent(folder)
-    for file in (output.export_estimated_poses_to_csv, output.export_localized_poses_to_csv):
-        if file is not None:
-            check_writable(file, overwrite=output.overwrite_existing_map)
+    poses = output.export_estimated_poses_to_csv, output.export_localized_poses_to_csv
+    check_writable(*poses, overwrite=output.overwrite_existing_map)
 
 
 def _check_live(folder: Path | None, data: DataSourceOptions, run: RunOptions) -> None:

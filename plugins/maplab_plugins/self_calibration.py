@@ -296,9 +296,7 @@ def evaluate_segment_information(
     from maplab_py.algorithms.self_calibration import drawing
     from maplab_py.algorithms.self_calibration.segments.selection import segment_information
 
-    for file in (plot, csv):
-        if file is not None:
-            check_writable(file, overwrite=overwrite)
+    check_writable(plot, csv, overwrite=overwrite)
     report, segments = segment_information(
         context.vi_map,
         options,
@@ -374,8 +372,7 @@ def export_calibration(
     vi_map = context.vi_map
     device = device_of(vi_map, chosen.rows(context.vi_map))
     contents = exported(vi_map.sensors, *device, format, imu_rate_hz=imu_rate_hz(vi_map))
-    for name in contents:
-        check_writable(folder / name, overwrite=overwrite)
+    check_writable(*(folder / name for name in contents), overwrite=overwrite)
     for name, text in contents.items():
         write_text(folder / name, [text], overwrite=overwrite)
     return ExportedFiles(tuple(folder / name for name in contents))

@@ -124,8 +124,7 @@ def _check_folder(
             )
     names = [f"{kind}{suffix}" for kind in colmap.FILES] + [colmap.FILE_NAME]
     names += [DATABASE] if options.colmap_database else []
-    for file in names:
-        check_writable(folder / file, overwrite=overwrite)
+    check_writable(*(folder / file for file in names), overwrite=overwrite)
     return tuple(names)
 
 

@@ -171,8 +171,7 @@ def check_bag_writable(path: Path, kind: BagFormat, *, overwrite: bool) -> None:
         others = sorted(entry.name for entry in path.iterdir() if path / entry.name not in files)
         if others:
             raise UserError(f"{path} has other files ({others[0]}): name a new folder for the bag")
-    for file in files:
-        check_writable(file, overwrite=overwrite)
+    check_writable(*files, overwrite=overwrite)
 
 
 def write_bag(

@@ -42,8 +42,7 @@ def show_in_rerun(
         raise UserError(
             "--viewer=rerun needs the library rerun-sdk: install it with `pip install 'maplab-py[rerun]'`"
         )
-    if file is not None:
-        check_writable(file, overwrite=overwrite)
+    check_writable(file, overwrite=overwrite)
     import rerun as rr
 
     drawing = make_checked_drawing(subject)
