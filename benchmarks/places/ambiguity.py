@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from maplab_py.algorithms.landmarks.quality import evaluate_unknown_quality
-from maplab_py.algorithms.loop_closure.alignment_contest import Contest
+from maplab_py.algorithms.loop_closure.ambiguity import Contest
 from maplab_py.algorithms.loop_closure.detection import detect
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.console.commands.registry import load_registry

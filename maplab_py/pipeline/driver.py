@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from maplab_py.errors import Cancelled, UserError
-from maplab_py.pipeline import engines, fingerprint, messages, records
+from maplab_py.pipeline import engines, messages, records
 from maplab_py.pipeline import progress as report
 from maplab_py.pipeline.options import PipelineOptions
 from maplab_py.pipeline.plan import MAPS, Pipeline, Stage, ordered
@@ -217,7 +217,7 @@ class Driver:
 
     def _hash(self, folder: Path) -> str:
         if folder not in self._hashes:
-            self._hashes[folder] = fingerprint.folder_hash(folder)
+            self._hashes[folder] = records.folder_hash(folder)
         return self._hashes[folder]
 
     # running

@@ -28,7 +28,7 @@ import numpy as np
 
 from maplab_py.atomic import move_folder, system, write_file
 from maplab_py.errors import MapError, UserError, os_errors_as
-from maplab_py.pipeline.fingerprint import folder_hash
+from maplab_py.pipeline.records import folder_hash
 from maplab_py.storage import checksums, native
 from maplab_py.storage.resources.store import MAP_FOLDER
 from maplab_py.vimap import VIMap, merge

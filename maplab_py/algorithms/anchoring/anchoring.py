@@ -31,7 +31,7 @@ from maplab_py.algorithms.anchoring.pairs import (
     strongest_pairs,
 )
 from maplab_py.algorithms.landmarks.quality import evaluate_unknown_quality
-from maplab_py.algorithms.loop_closure import alignment_contest, features, record_updates, workflow
+from maplab_py.algorithms.loop_closure import ambiguity, features, record_updates, workflow
 from maplab_py.algorithms.loop_closure.detection import Detection, detect
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.array_types import F64, I64, NDArray
@@ -51,7 +51,7 @@ def anchor_missions(
     loop_options: LoopClosureOptions = _LOOPS,
     *,
     missions: I64 | None = None,
-    choice: alignment_contest.AlignmentChoice | None = None,
+    choice: ambiguity.AlignmentChoice | None = None,
     absolute: AbsoluteAnchoringOptions = _ABSOLUTE,
     projections: features.ProjectionMemory | None = None,
     progress: Progress = SILENT,
@@ -85,7 +85,7 @@ def anchor_missions(
     if not known.any() or not wanted.any():
         return vi_map, _nothing_to_do(already_known, by_poses, refusals, known, wanted)
     if options.hypothesis:
-        choice = alignment_contest.AlignmentChoice(options.hypothesis)
+        choice = ambiguity.AlignmentChoice(options.hypothesis)
     judged, notes = evaluate_unknown_quality(vi_map, progress)
     detection = _between_missions(judged, loop_options, choice, projections, progress)
     T_G_M, reached, pairs = _align(
@@ -122,7 +122,7 @@ def anchor_missions(
 def _between_missions(
     vi_map: VIMap,
     options: LoopClosureOptions,
-    choice: alignment_contest.AlignmentChoice | None,
+    choice: ambiguity.AlignmentChoice | None,
     projections: features.ProjectionMemory | None,
     progress: Progress,
 ) -> Detection:
@@ -295,17 +295,17 @@ def _with_base_frames(vi_map: VIMap, T_G_M: F64, anchored: NDArray[np.bool_]) ->
 
 
 def described_hypotheses(
-    contests: Sequence[alignment_contest.Contest], names: Sequence[str]
+    contests: Sequence[ambiguity.Contest], names: Sequence[str]
 ) -> tuple[AlignmentHypothesis, ...]:
     """Describe the alignments of all pairs of missions that have several or none that wins."""
     return tuple(
         _describe_hypothesis(number, contests[i], k, names)
-        for number, (i, k) in enumerate(alignment_contest.listed_alignments(contests), start=1)
+        for number, (i, k) in enumerate(ambiguity.listed_alignments(contests), start=1)
     )
 
 
 def _describe_hypothesis(
-    number: int, contest: alignment_contest.Contest, k: int, names: Sequence[str]
+    number: int, contest: ambiguity.Contest, k: int, names: Sequence[str]
 ) -> AlignmentHypothesis:
     alignments = contest.pair.alignments
     alignment = alignments[k]
@@ -329,7 +329,7 @@ def _describe_hypothesis(
     )
 
 
-def _outcome(contest: alignment_contest.Contest, k: int) -> str:
+def _outcome(contest: ambiguity.Contest, k: int) -> str:
     if contest.winner < 0:
         return "undecided"
     if k == contest.winner:
@@ -360,9 +360,7 @@ def place_mission(vi_map: VIMap, mission: int, T_G_M: F64) -> tuple[VIMap, Ancho
     return vi_map.replace(baseframes=frames), report
 
 
-def choice_near(
-    vi_map: VIMap, mission: int, to: int, T_G_M: F64
-) -> alignment_contest.AlignmentChoice:
+def choice_near(vi_map: VIMap, mission: int, to: int, T_G_M: F64) -> ambiguity.AlignmentChoice:
     """Return the choice of the alignment of two missions that is near a pose (4,) of the first.
 
     Raises:
@@ -377,8 +375,8 @@ def choice_near(
     T_G_to = yaw.from_pose(vi_map.T_G_M)[to]
     T_to_M = yaw.compose(yaw.inverse(T_G_to), T_G_M)
     if mission < to:
-        return alignment_contest.AlignmentChoice(missions=(mission, to), T_B_A=T_to_M)
-    return alignment_contest.AlignmentChoice(missions=(to, mission), T_B_A=yaw.inverse(T_to_M))
+        return ambiguity.AlignmentChoice(missions=(mission, to), T_B_A=T_to_M)
+    return ambiguity.AlignmentChoice(missions=(to, mission), T_B_A=yaw.inverse(T_to_M))
 
 
 def _require_unknown(vi_map: VIMap, mission: int) -> None:

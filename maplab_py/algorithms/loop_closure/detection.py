@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from maplab_py.algorithms.loop_closure import alignment_contest, closure_table, gates, matching
+from maplab_py.algorithms.loop_closure import ambiguity, closure_table, gates, matching
 from maplab_py.algorithms.loop_closure.candidates import (
     Candidates,
     Matches,
@@ -45,7 +45,7 @@ class Detection:
     descriptor_matches: int
     best_votes: int  # most matches of a query vertex with a place if there is no candidate
     notes: tuple[str, ...] = ()
-    contests: tuple[alignment_contest.Contest, ...] = ()  # of missions of unknown relative pose
+    contests: tuple[ambiguity.Contest, ...] = ()  # of missions of unknown relative pose
 
 
 def detect(
@@ -55,7 +55,7 @@ def detect(
     missions: I64,
     only_other_missions: bool = False,
     trust_base_frames: bool = True,
-    choice: alignment_contest.AlignmentChoice | None = None,
+    choice: ambiguity.AlignmentChoice | None = None,
     scope: SearchScope = _EVERYTHING,
     progress: Progress = SILENT,
 ) -> Detection:
@@ -160,8 +160,8 @@ def _closures(
     search: PoseSearch,
     options: LoopClosureOptions,
     trust_base_frames: bool,
-    choice: alignment_contest.AlignmentChoice | None,
-) -> tuple[closure_table.Closures, tuple[alignment_contest.Contest, ...]]:
+    choice: ambiguity.AlignmentChoice | None,
+) -> tuple[closure_table.Closures, tuple[ambiguity.Contest, ...]]:
     """Build the table of closures with the verdicts of the gates."""
     s, query = search.solutions, candidates.query_vertex
     place = _most_seen(vi_map, search, candidates.place_vertex)

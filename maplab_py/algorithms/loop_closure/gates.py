@@ -12,7 +12,7 @@ import numpy as np
 
 from maplab_py.algorithms.gate import YES_NO, Gate
 from maplab_py.algorithms.landmarks.keypoint_rays import largest_sigma
-from maplab_py.algorithms.loop_closure import alignment_contest, mission_alignment
+from maplab_py.algorithms.loop_closure import ambiguity, mission_alignment
 from maplab_py.algorithms.loop_closure.closure_record import ClosureRecord
 from maplab_py.algorithms.loop_closure.closure_table import VERDICTS, GateValues
 from maplab_py.algorithms.loop_closure.consensus import check_consensus, path_lengths
@@ -227,8 +227,8 @@ def judge(
     measured: GateValues,
     options: LoopClosureOptions,
     *,
-    choice: alignment_contest.AlignmentChoice | None = None,
-) -> tuple[GateValues, list[alignment_contest.Contest]]:
+    choice: ambiguity.AlignmentChoice | None = None,
+) -> tuple[GateValues, list[ambiguity.Contest]]:
     """Apply all gates: geometry, plausible drift, ambiguity, consensus of neighbours.
 
     Args:
@@ -273,8 +273,8 @@ def judge(
 
 
 def _contests(
-    j: Judgement, geometric: Mask, choice: alignment_contest.AlignmentChoice | None
-) -> list[alignment_contest.Contest]:
+    j: Judgement, geometric: Mask, choice: ambiguity.AlignmentChoice | None
+) -> list[ambiguity.Contest]:
     """Weigh the alignments of missions for which closures between unrelated missions vote.
 
     Closures with far places of the query's mission show which places look alike. `geometric` (N,) are
@@ -286,10 +286,10 @@ def _contests(
     is_alias = geometric & j.is_far & (v.inliers >= _MIN_RIVAL_INLIERS)
     pairs = mission_alignment.alignments_of_pairs(j.paired, voting | is_alias)
     names = [to_hex(words)[:8] for words in j.vi_map.missions.id]
-    contests = alignment_contest.decide(j.vi_map, pairs, j.stretch, max_share, names)
+    contests = ambiguity.decide(j.vi_map, pairs, j.stretch, max_share, names)
     is_open = [contest.winner < 0 for contest in contests]
     if choice is not None:
-        contests = alignment_contest.with_choice(contests, choice)
+        contests = ambiguity.with_choice(contests, choice)
     for contest, was_open in zip(contests, is_open, strict=True):
         rows = contest.pair.rows
         v.is_decided[rows] = contest.winner >= 0
@@ -395,7 +395,7 @@ def _adds_little(group: I64, explained: I64) -> bool:
     """Return whether most stretches of a group, and significantly more others, are explained without it."""
     theirs = len(np.setdiff1d(group, explained))
     ours = len(np.setdiff1d(explained, group))
-    return alignment_contest.is_significant(ours, theirs) and theirs <= _MAX_NEW_SHARE * len(group)
+    return ambiguity.is_significant(ours, theirs) and theirs <= _MAX_NEW_SHARE * len(group)
 
 
 def _stretches(alignment: mission_alignment.Alignment) -> I64:

@@ -15,7 +15,7 @@ from maplab_py import atomic, cancellation
 from maplab_py.console.commands.flag_types import expand_path
 from maplab_py.console.commands.lines import TypedCommand, typed_commands, variable_lookup
 from maplab_py.console.scripts import aliases, checking, costs
-from maplab_py.console.scripts.rescue import Rescue
+from maplab_py.console.scripts.recovery import Rescue
 from maplab_py.console.session import jobs, paths
 from maplab_py.console.session.call import Call
 from maplab_py.console.session.session import Refusal, Session

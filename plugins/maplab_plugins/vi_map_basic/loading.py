@@ -165,7 +165,7 @@ def recover(context: CommandContext, run: str = "") -> LoadedMaps:
     Args:
         run: Name of an earlier script's folder, as the error said; empty = the latest.
     """
-    from maplab_py.console.scripts.rescue import rescue_folder, rescued_runs
+    from maplab_py.console.scripts.recovery import rescue_folder, rescued_runs
     from maplab_py.storage.native import find_maps, load_map
 
     runs = [path for path in rescued_runs() if run in ("", path.name, str(path))]

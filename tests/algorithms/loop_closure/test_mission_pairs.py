@@ -8,7 +8,7 @@ import pytest
 from maplab_py.algorithms.anchoring.anchoring import anchor_missions
 from maplab_py.algorithms.loop_closure import candidates, detection, matching
 from maplab_py.algorithms.loop_closure import features as features_module
-from maplab_py.algorithms.loop_closure.alignment_contest import (
+from maplab_py.algorithms.loop_closure.ambiguity import (
     AlignmentChoice,
     decide,
     listed_alignments,
