@@ -5,7 +5,7 @@ from contextlib import contextmanager
 
 
 class MaplabError(Exception):
-    """Root of every error that this project raises on purpose.
+    """Base class of all errors that maplab-py raises deliberately.
 
     Attributes:
         remedy: Command line after which the refused command can be run again; empty if none is known.

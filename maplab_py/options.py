@@ -38,7 +38,7 @@ def option(
     le: float | None = None,
     lt: float | None = None,
 ) -> Any:
-    """Declare a field of an options class whose default and help do not say all.
+    """Declare a field of an options class with its range, unit, choices or flag name.
 
     Args:
         default: Default value; its type must match the field's annotation.

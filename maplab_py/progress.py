@@ -4,7 +4,7 @@ from typing import Protocol
 
 
 class Progress(Protocol):
-    """Interface of the console for algorithms: a bar, a line of text, and the wish to cancel."""
+    """Progress bar, lines of text and cancellation of a running algorithm."""
 
     def step(self, done: float, total: float, what: str = "") -> None:
         """Say that `done` of `total` is finished; raises Cancelled when the user wants to stop."""

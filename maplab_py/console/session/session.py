@@ -105,7 +105,7 @@ class Session:
 
     @property
     def mission_names(self) -> dict[str, str]:
-        """The labels of the missions in memory by their ids; those of the selected map win."""
+        """Labels of all missions in memory by id; those of the selected map take precedence."""
         from maplab_py.console.terminal.render import names_by_id
         from maplab_py.vimap.ids import to_hex_list
         from maplab_py.vimap.queries import mission_labels
@@ -183,7 +183,7 @@ class Session:
         return call_from_words(words, self.registry, self.settings)
 
     def run_line(self, text: str, terminal: Terminal) -> None:
-        """Run the commands of a typed line inside another command and show their reports.
+        """Run the commands of a line inside another command, and show their reports.
 
         Raises:
             MaplabError: The first error of any of them.
