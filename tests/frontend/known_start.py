@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
 from maplab_py.estimation.window.frame import StartState, WindowFrame
+from maplab_py.frontend.odometry import Odometry
+from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.frontend.starting import Start
 from maplab_py.geometry.interpolation import interpolate_poses, nearest_rows
-from maplab_py.interop.recordings.protocol import RecordedSensors
+from maplab_py.interop.recordings.protocol import Event, ImuBatch, RecordedSensors, TrackedFrameSet
 from maplab_py.interop.trajectories import Trajectory
 
 SIGMA = np.repeat([1e-4, 5e-3, 0.05, 0.05, 0.3], 3)
@@ -44,3 +47,13 @@ class KnownStart:
         v_M, b_g, b_a = (x[None] for x in (self.truth.v_R[row], gyro_bias, accel_bias))
         state = StartState(time_ns, T_M_I, v_M, b_g, b_a, SIGMA)
         return Start(frame, state)
+
+
+def updates_of(odometry: Odometry, events: Iterable[Event]) -> Iterator[OdometryUpdate]:
+    """Yield the updates of an odometry that reads tracks and samples."""
+    for event in events:
+        if isinstance(event, ImuBatch):
+            yield from odometry.push_imu(event)
+        else:
+            assert isinstance(event, TrackedFrameSet)
+            yield from odometry.push_tracks(event)

@@ -27,7 +27,7 @@ from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.simulation.scenario import MotionOptions
 from maplab_py.vimap.nav_state import NavState
 from tests.estimation.window.recordings import scenario, simulated
-from tests.frontend.known_start import KnownStart
+from tests.frontend.known_start import KnownStart, updates_of
 from tests.frontend.simulated import REST_FIRST, position_errors, replayed
 
 
@@ -39,14 +39,7 @@ def events_of(**changes: object) -> tuple[RecordedSensors, list[Event], KnownSta
 
 
 def pushed(odometry: Odometry, events: list[Event]) -> list[OdometryUpdate]:
-    updates: list[OdometryUpdate] = []
-    for event in events:
-        if isinstance(event, ImuBatch):
-            updates += odometry.push_imu(event)
-        else:
-            assert isinstance(event, TrackedFrameSet)
-            updates += odometry.push_tracks(event)
-    return updates
+    return list(updates_of(odometry, events))
 
 
 def states_of(updates: list[OdometryUpdate]) -> NavState:

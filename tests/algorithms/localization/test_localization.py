@@ -25,13 +25,13 @@ from maplab_py.errors import EstimationError, FlagError, UserError
 from maplab_py.frontend.localization.keypoints import FrameKeypoints, frame_keypoints
 from maplab_py.frontend.odometry import Odometry
 from maplab_py.geometry import se3, so3
-from maplab_py.interop.recordings.protocol import ImuBatch
 from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.simulation.scenario import MeasurementOptions, Scenario, SessionOptions, WorldOptions
 from maplab_py.simulation.simulate import simulate
 from maplab_py.vimap import IdIndex, VIMap
 from maplab_py.vimap.descriptors import binary_blocks
 from maplab_py.vision.descriptors import pack_words
+from tests.frontend.known_start import updates_of
 from tests.frontend.localization.places import place, summary
 from tests.support.noiseless import without_noise
 
@@ -304,14 +304,10 @@ def frames() -> list[tuple[FrameKeypoints, F64]]:
     recording = place().recording()
     odometry = Odometry(recording.device, make_starter=place().start)
     result = []
-    for event in EventStream(recording):
-        updates = (
-            odometry.push_imu(event) if isinstance(event, ImuBatch) else odometry.push_tracks(event)
-        )
-        for update in updates:
-            seen = frame_keypoints(update, recording.device)
-            row = int(np.searchsorted(place().times_ns, update.time_ns))
-            result.append((seen, place().T_G_I[row]))
+    for update in updates_of(odometry, EventStream(recording)):
+        seen = frame_keypoints(update, recording.device)
+        row = int(np.searchsorted(place().times_ns, update.time_ns))
+        result.append((seen, place().T_G_I[row]))
     return [pair for pair in result if len(pair[0]) > 30][::5]
 
 

@@ -25,6 +25,16 @@ from maplab_py.simulation.spline import MotionState, PoseSpline
 
 IMAGE_HZ, IMU_HZ = 20.0, 200.0
 NOISE_PX = 0.5
+EXACT_IMU = ImuOptions(
+    rate_hz=IMU_HZ,
+    gyro_noise_density=0.0,
+    accel_noise_density=0.0,
+    gyro_bias_walk=0.0,
+    accel_bias_walk=0.0,
+    gyro_bias_sigma=0.03,
+    accel_bias_sigma=0.05,
+)
+"""Without noise, with biases."""
 _SPACING_S = 0.1
 _Q_I_C = so3.from_matrix(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))
 

@@ -1,5 +1,7 @@
 """Gyroscope bias from epipolar geometry, and the closed form for velocity, gravity and bias."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -17,19 +19,10 @@ from maplab_py.frontend.initialization.rays import RayMaker, SegmentRays
 from maplab_py.frontend.initialization.refinement import mission_frame
 from maplab_py.frontend.initialization.segment import History, Segment
 from maplab_py.geometry import so3
-from maplab_py.simulation.scenario import ImuOptions
 from tests.frontend.initialization import flights
 from tests.frontend.initialization.flights import Flight, fly, lively
 
-EXACT = ImuOptions(
-    rate_hz=200.0,
-    gyro_noise_density=0.0,
-    accel_noise_density=0.0,
-    gyro_bias_walk=0.0,
-    accel_bias_walk=0.0,
-    gyro_bias_sigma=0.03,
-    accel_bias_sigma=0.0,
-)
+EXACT = dataclasses.replace(flights.EXACT_IMU, accel_bias_sigma=0.0)
 
 
 def segment_of(flight: Flight, interval_s: float = 0.2) -> tuple[Segment, SegmentRays]:

@@ -12,19 +12,9 @@ from maplab_py.estimation.window.states import WindowStates
 from maplab_py.frontend.initialization.normal_points import with_normal_points
 from maplab_py.frontend.initialization.segment import History, ObservedFrames, Segment
 from maplab_py.sensors.projection import project
-from maplab_py.simulation.scenario import ImuOptions
-from tests.frontend.initialization.flights import NOISE_PX, Flight, fly, lively
+from tests.frontend.initialization.flights import EXACT_IMU, NOISE_PX, Flight, fly, lively
 
 GATE_CHI2 = 13.8
-EXACT_IMU = ImuOptions(
-    rate_hz=200.0,
-    gyro_noise_density=0.0,
-    accel_noise_density=0.0,
-    gyro_bias_walk=0.0,
-    accel_bias_walk=0.0,
-    gyro_bias_sigma=0.03,
-    accel_bias_sigma=0.05,
-)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

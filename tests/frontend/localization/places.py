@@ -16,7 +16,6 @@ from maplab_py.frontend.localization.options import OnlineLocalizationOptions
 from maplab_py.frontend.odometry import Odometry
 from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.interop.recordings.map_replay import MapRecording
-from maplab_py.interop.recordings.protocol import ImuBatch, TrackedFrameSet
 from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.simulation.scenario import MeasurementOptions, Scenario, SessionOptions, WorldOptions
@@ -25,7 +24,7 @@ from maplab_py.simulation.truth import true_map
 from maplab_py.storage.summary_map import SummaryMap
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.ids import IdIndex
-from tests.frontend.known_start import KnownStart
+from tests.frontend.known_start import KnownStart, updates_of
 from tests.support.noiseless import without_noise
 
 
@@ -106,15 +105,9 @@ def run(
     localization = OnlineLocalization(
         map_ or searched(), recording.device, options, features=features
     )
-    frames, all_updates = [], []
-    for event in EventStream(recording):
-        if isinstance(event, ImuBatch):
-            updates = odometry.push_imu(event)
-        else:
-            assert isinstance(event, TrackedFrameSet)
-            updates = odometry.push_tracks(event)
-        images = (np.zeros((8, 8), dtype=np.uint8),) if features else ()
-        for update in [dataclasses.replace(each, images=images) for each in updates]:
-            frames.append(localization.after_frame(update, odometry.smoother))
-            all_updates.append(update)
-    return localization, frames, all_updates
+    frames, updates = [], []
+    images = (np.zeros((8, 8), dtype=np.uint8),) if features else ()
+    for update in updates_of(odometry, EventStream(recording)):
+        updates.append(dataclasses.replace(update, images=images))
+        frames.append(localization.after_frame(updates[-1], odometry.smoother))
+    return localization, frames, updates

@@ -1,6 +1,7 @@
 """When T_G_M is set and set again, and what happens to late answers."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -13,8 +14,8 @@ from maplab_py.frontend.localization.online import OnlineLocalization
 from maplab_py.frontend.localization.options import OnlineLocalizationOptions
 from maplab_py.frontend.odometry import Odometry
 from maplab_py.geometry import se3
-from maplab_py.interop.recordings.protocol import ImuBatch, TrackedFrameSet
 from maplab_py.interop.recordings.stream import EventStream
+from tests.frontend.known_start import updates_of
 from tests.frontend.localization.places import place, searched, summary
 
 P_G = np.array([[5.0, 0.0, 0.0], [5.0, 1.0, 0.0], [5.0, 0.0, 1.0], [6.0, -1.0, 1.0]])
@@ -119,21 +120,9 @@ def halfway() -> tuple[OnlineLocalization, Odometry, list[Answer]]:
     recording = where.recording()
     odometry = Odometry(recording.device, make_starter=where.start, map_rule=options.rule)
     localization = OnlineLocalization(searched(), recording.device, options)
-    answers, frames = [], 0
-    for event in EventStream(recording):
-        if isinstance(event, ImuBatch):
-            updates = odometry.push_imu(event)
-        else:
-            assert isinstance(event, TrackedFrameSet)
-            updates = odometry.push_tracks(event)
-        for update in updates:
-            frame = localization.after_frame(update, odometry.smoother)
-            frames += 1
-            if frame.answer is not None:
-                answers.append(frame.answer)
-        if frames >= 20:
-            break
-    return localization, odometry, answers
+    some = itertools.islice(updates_of(odometry, EventStream(recording)), 20)
+    frames = [localization.after_frame(update, odometry.smoother) for update in some]
+    return localization, odometry, [f.answer for f in frames if f.answer is not None]
 
 
 def test_a_late_answer_joins_its_frame(
@@ -169,20 +158,14 @@ def test_a_map_that_moved_is_found_again_within_a_second_and_a_half() -> None:
     moved_ns = int(where.times_ns[0]) + 3 * 10**9
     errors: dict[int, float] = {}
     is_moved = False
-    for event in EventStream(recording):
-        if isinstance(event, ImuBatch):
-            updates = odometry.push_imu(event)
-        else:
-            assert isinstance(event, TrackedFrameSet)
-            updates = odometry.push_tracks(event)
-        for update in updates:
-            if update.time_ns >= moved_ns and not is_moved:
-                map_.database.p_G[:] += shift
-                is_moved = True
-            pose = localization.after_frame(update, odometry.smoother).pose
-            if pose is not None and is_moved:
-                truth = where.T_G_I[np.searchsorted(where.times_ns, update.time_ns), 4:] + shift
-                errors[update.time_ns] = float(np.linalg.norm(pose.T_G_I[4:] - truth))
+    for update in updates_of(odometry, EventStream(recording)):
+        if update.time_ns >= moved_ns and not is_moved:
+            map_.database.p_G[:] += shift
+            is_moved = True
+        pose = localization.after_frame(update, odometry.smoother).pose
+        if pose is not None and is_moved:
+            truth = where.T_G_I[np.searchsorted(where.times_ns, update.time_ns), 4:] + shift
+            errors[update.time_ns] = float(np.linalg.norm(pose.T_G_I[4:] - truth))
     seconds = 1e-9 * (np.array(list(errors)) - moved_ns)
     error_m = np.array(list(errors.values()))
     assert error_m[0] > 1.5

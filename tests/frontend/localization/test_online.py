@@ -13,9 +13,9 @@ from maplab_py.frontend.localization.options import MODES, OnlineLocalizationOpt
 from maplab_py.frontend.odometry import Odometry
 from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.geometry import se3, so3
-from maplab_py.interop.recordings.protocol import ImuBatch, TrackedFrameSet
 from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.storage.summary_map import SummaryMap
+from tests.frontend.known_start import updates_of
 from tests.frontend.localization.places import place, run, searched, summary
 
 OPTIONS = OnlineLocalizationOptions()
@@ -98,13 +98,7 @@ def test_the_same_run_gives_the_same_bytes() -> None:
 def test_baselines_do_not_change_the_odometry(mode: str) -> None:
     _, _, updates = run(with_mode(mode))
     odometry = Odometry(place().recording().device, make_starter=place().start)
-    plain: list[OdometryUpdate] = []
-    for event in EventStream(place().recording()):
-        if isinstance(event, ImuBatch):
-            plain += odometry.push_imu(event)
-        else:
-            assert isinstance(event, TrackedFrameSet)
-            plain += odometry.push_tracks(event)
+    plain = list(updates_of(odometry, EventStream(place().recording())))
     assert poses(updates).tobytes() == poses(plain).tobytes()
 
 
