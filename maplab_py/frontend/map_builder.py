@@ -3,7 +3,6 @@
 import itertools
 from collections.abc import Sequence
 from concurrent.futures import Future
-from pathlib import Path
 
 from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions, TrackReport
 from maplab_py.algorithms.landmarks.tracks import init_tracks
@@ -31,20 +30,12 @@ class MapBuilder:
         missions: Records of all missions, those without vertices included; the last one grows.
     """
 
-    def __init__(
-        self,
-        device: RecordedSensors,
-        options: MapBuilderOptions | None = None,
-        *,
-        staging_parent: Path | None = None,
-    ) -> None:
+    def __init__(self, device: RecordedSensors, options: MapBuilderOptions | None = None) -> None:
         """Start without missions.
 
         Args:
             device: The sensors, with an IMU.
             options: See there.
-            staging_parent: Folder for the temporary folder of image resources; None = the
-                system's.
 
         Raises:
             UserError: The temporary folder cannot be made.
@@ -53,7 +44,7 @@ class MapBuilder:
         seed = f"{device.rig_id} {device.imu_id}".encode()
         self._images = None
         if self._options.save_image_as_resources:
-            self._images = NewResources(staging_parent, seed=seed)
+            self._images = NewResources(seed=seed)
         self.missions: list[RecordedMission] = []
         self._devices: list[RecordedSensors] = []  # of the missions
         self._waiting: dict[int, tuple[VertexFrames, list[int]]] = {}

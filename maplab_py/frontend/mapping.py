@@ -6,7 +6,6 @@ import time
 from array import array
 from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -58,7 +57,6 @@ class Mapping:
         recording: protocol.Recording,
         options: run_options.RunOptions | None = None,
         *,
-        staging_parent: Path | None = None,
         observer: Observer | None = None,
         make_starter: starting.MakeStarter | None = None,
         on_estimate: Callable[[OdometryUpdate, Mapping], None] | None = None,
@@ -70,7 +68,6 @@ class Mapping:
         Args:
             recording: Recording with an IMU.
             options: See there.
-            staging_parent: Folder for the temporary folder of images; None = the system's.
             observer: Told of every frame.
             make_starter: See `Odometry`.
             on_estimate: Told of every frame before the map is built, as publishers of poses are.
@@ -102,9 +99,7 @@ class Mapping:
         )
         self.builder: map_builder.MapBuilder | None = None
         if self.options.output.run_map_builder:
-            self.builder = map_builder.MapBuilder(
-                recording.device, self.options.builder, staging_parent=staging_parent
-            )
+            self.builder = map_builder.MapBuilder(recording.device, self.options.builder)
         self.stream = stream.EventStream(recording, self.options.stream)
         self.statistics = run_statistics.RunStatistics()
         self.problem = ""

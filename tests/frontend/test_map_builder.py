@@ -186,7 +186,7 @@ def test_final_estimates_replace_the_first(stereo: VIMap) -> None:
 def test_images_become_resources_of_frames(stereo: VIMap, tmp_path: Path) -> None:
     options = dataclasses.replace(OFTEN, save_image_as_resources=True)
     device = MapRecording(stereo, 0).device
-    builder = MapBuilder(device, options, staging_parent=tmp_path)
+    builder = MapBuilder(device, options)
     builder.start_mission()
     frames = [e for e in EventStream(MapRecording(stereo, 0)) if isinstance(e, TrackedFrameSet)]
     samples = np.zeros((2, 6))

@@ -26,9 +26,9 @@ def visual_kernels(progress: Progress = SILENT) -> ModuleType:
     return generated_module("visual", _visual_source, progress)
 
 
-def window_kernels(progress: Progress = SILENT) -> ModuleType:
+def window_kernels() -> ModuleType:
     """Return the module of the template `window`, with cameras as `visual_kernels` has them."""
-    return generated_module("window", _window_source, progress)
+    return generated_module("window", _window_source, SILENT)
 
 
 def model_code(projection: Projection, distortion: Distortion) -> int:
@@ -48,11 +48,10 @@ def residual_kernel(
     return generated_module(name, lambda: _batch_source(make_function()), progress)
 
 
-def pose_graph_kernels(error: PoseError, progress: Progress = SILENT) -> ModuleType:
+def pose_graph_kernels(error: PoseError) -> ModuleType:
     """Return the module of the template `pose_graph` for one kind of residual."""
-    return generated_module(
-        f"pose_graph_{error.value}", lambda: _pose_graph_source(error), progress
-    )
+    name = f"pose_graph_{error.value}"
+    return generated_module(name, lambda: _pose_graph_source(error), SILENT)
 
 
 _POSE, _LANDMARK, _CAMERA = 3, 15, 21

@@ -23,6 +23,7 @@ from maplab_py.estimation.linear.supernodal_solver import SupernodalCholesky
 from maplab_py.estimation.problem.preconditioner import Preconditioner
 from maplab_py.estimation.problem.problem import Linearization, Problem
 from maplab_py.estimation.problem.protocol import Step
+from maplab_py.estimation.problem.trust_region import added_damping
 from maplab_py.estimation.states import States
 from maplab_py.estimation.terms import factor as factor_terms
 from maplab_py.estimation.terms.prior import PosePrior
@@ -31,8 +32,6 @@ from maplab_py.estimation.terms.visual import Observations, VisualTerms, pose_pa
 from maplab_py.estimation.terms.visual_products import PoseSystem, VisualProducts
 from maplab_py.geometry import se3
 from maplab_py.memory import NotEnoughMemory
-
-_SMALLEST_DAMPED, _LARGEST_DAMPED = 1e-6, 1e32
 
 
 @dataclasses.dataclass(frozen=True)
@@ -240,13 +239,13 @@ class IterativeProblem(Problem):
 
     def _prepare(self, linear: ReducedOperator, damping: float) -> F64:
         """Factorise the preconditioner; return the damping (nodes, 3) that is added."""
-        added = damping * np.clip(linear.diagonal, _SMALLEST_DAMPED, _LARGEST_DAMPED)
+        added = added_damping(linear.diagonal, damping)
         size = (linear.diagonal + added).max(axis=1, initial=1.0)
         self._held = np.flatnonzero(self._restricted)
         self._preconditioner.factor(
             added, linear.pose_blocks, linear.factor_blocks, self._projector, size
         )
-        return np.asarray(added)
+        return added
 
     def _conjugate_gradients(
         self,

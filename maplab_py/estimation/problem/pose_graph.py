@@ -86,7 +86,6 @@ class PoseGraphProblem:
         closures: RelativePoses,
         tilt: TiltPriors,
         loss: Loss,
-        ordering: OrderingKind = OrderingKind.AUTO,
     ) -> None:
         """Analyse the structure of the normal equations."""
         self._closures, edges = closures, trajectory.followed_by(closures)
@@ -119,7 +118,7 @@ class PoseGraphProblem:
             np.concatenate([node[kept].min(axis=1), nodes]),
             size,
             6,
-            ordering=Ordering(ordering),
+            ordering=Ordering(OrderingKind.AUTO),
         )
         self._has_second_order = False
         self._linear: tuple[F64, PoseLinearization] | None = None

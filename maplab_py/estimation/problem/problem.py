@@ -11,12 +11,11 @@ from maplab_py.estimation.linear.ordering import Ordering, OrderingKind
 from maplab_py.estimation.linear.pattern import joint_covariance
 from maplab_py.estimation.linear.supernodal_solver import BlockPlaces, SupernodalCholesky
 from maplab_py.estimation.problem.protocol import Step
+from maplab_py.estimation.problem.trust_region import added_damping
 from maplab_py.estimation.states import NODE_NAMES, NODES_PER_VERTEX, States
 from maplab_py.estimation.terms import factor as factor_terms
 from maplab_py.estimation.terms.protocol import FactorTerm
 from maplab_py.estimation.terms.visual import VisualTerms
-
-SMALLEST_DAMPED, LARGEST_DAMPED = 1e-6, 1e32
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -271,7 +270,7 @@ class Problem:
         """Factorise the projected, damped equations; return the projected gradient."""
         self._assemble(linear)
         self._assembled = None
-        added = damping * np.clip(linear.diagonal, SMALLEST_DAMPED, LARGEST_DAMPED)
+        added = added_damping(linear.diagonal, damping)
         self._solver.add_to_diagonal(added)
         # directions that must not move get a pivot of the others' size: one that is small against
         # them would drown in their rounding errors

@@ -7,6 +7,8 @@ from enum import Enum
 
 import numpy as np
 
+from maplab_py.array_types import F64
+
 
 class Schedule(Enum):
     """Schedule by which the radius follows the gain, the share of the promised decrease that came true."""
@@ -15,11 +17,17 @@ class Schedule(Enum):
     STEP_QUALITY = "step_quality"  # the same, but bolder after nearly perfect steps
 
 
+_SMALLEST_DAMPED, _LARGEST_DAMPED = 1e-6, 1e32
 _LARGEST_FACTOR = 100.0
 _NEARLY_PERFECT = 0.02
 """A gain that misses one by less."""
 _NEAR = 0.05
 """Relative decrease of the cost: of larger ones nothing can be said about convergence."""
+
+
+def added_damping(diagonal: F64, damping: float) -> F64:
+    """Return what damping adds to the diagonal of normal equations."""
+    return np.asarray(damping * np.clip(diagonal, _SMALLEST_DAMPED, _LARGEST_DAMPED))
 
 
 class TrustRegion:

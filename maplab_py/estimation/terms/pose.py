@@ -29,9 +29,9 @@ def whitening(covariance: F64) -> F64:
     return symmetric.whitening(clean, _SMALLEST_VARIANCE)
 
 
-def mounting_block(T_I_S: F64, name: str = MOUNTING) -> ParameterBlock:
+def mounting_block(T_I_S: F64) -> ParameterBlock:
     """Return the block of sensors' extrinsics T_I_S (S, 7)."""
-    return ParameterBlock(name, T_I_S, Manifold.POSE)
+    return ParameterBlock(MOUNTING, T_I_S, Manifold.POSE)
 
 
 def switch_block(switches: F64) -> ParameterBlock:

@@ -13,12 +13,11 @@ from maplab_py.estimation.kernels.window_arguments import FRAME_SIZE
 from maplab_py.estimation.linear.protocol import NotPositiveDefinite
 from maplab_py.estimation.problem.protocol import Step
 from maplab_py.estimation.problem.solver import SolverOptions, optimize_states
+from maplab_py.estimation.problem.trust_region import added_damping
 from maplab_py.estimation.window.map_terms import MapTerms
 from maplab_py.estimation.window.states import WindowStates
 from maplab_py.geometry import se3, so3
 from maplab_py.progress import SILENT
-
-_SMALLEST_DAMPED, _LARGEST_DAMPED = 1e-6, 1e32
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -62,8 +61,7 @@ class AlignmentProblem:
         Raises:
             NotPositiveDefinite: The damped equations are singular.
         """
-        diagonal = np.diagonal(linear.square)
-        added = damping * np.clip(diagonal, _SMALLEST_DAMPED, _LARGEST_DAMPED)
+        added = added_damping(np.diagonal(linear.square), damping)
         try:
             step = np.linalg.solve(linear.square + np.diag(added), -linear.gradient)
         except np.linalg.LinAlgError:

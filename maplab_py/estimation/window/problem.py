@@ -11,13 +11,13 @@ from maplab_py.estimation.kernels import window_arguments
 from maplab_py.estimation.linear.protocol import NotPositiveDefinite
 from maplab_py.estimation.loss import Loss
 from maplab_py.estimation.problem.protocol import Step
+from maplab_py.estimation.problem.trust_region import added_damping
 from maplab_py.estimation.window.calibration import FrameTimes, WindowCalibration
 from maplab_py.estimation.window.factors import EVERY, FrameFactors, Part
 from maplab_py.estimation.window.map_terms import MapElimination, MapTerms
 from maplab_py.estimation.window.prior import WindowPrior
 from maplab_py.estimation.window.states import WindowStates, scale_sigma
 
-_SMALLEST_DAMPED, _LARGEST_DAMPED = 1e-6, 1e32
 _LANDMARK_DAMPING, _NEARLY_UNDAMPED = 1e-12, 1e-4
 """Relative damping of landmarks for covariances: those without parallax stay solvable; and largest."""
 
@@ -88,7 +88,7 @@ class WindowProblem:
             NotPositiveDefinite: The damped equations are singular.
         """
         system, rule = linear.system, linear.rule
-        added = damping * np.clip(system.diagonal, _SMALLEST_DAMPED, _LARGEST_DAMPED)
+        added = added_damping(system.diagonal, damping)
         matrix = system.matrix.copy()
         matrix.reshape(-1)[:: len(matrix) + 1] += added
         step = -self._solved(_factorised(matrix), system.reduced_gradient)

@@ -80,9 +80,6 @@ class FrameTracker:
             self._options.pyramid_levels,
             self._options.forward_backward_px * factor,
         )
-        self._stereo = StereoOptions(
-            self._flow, self._options.epipolar_gate_px, self._options.stereo_distance_m
-        )
         self._next_id = self._num_frames = 0
         self._detected = [np.inf] * len(cameras)  # keypoints after the last detection
         self._states: tuple[_CameraState, ...] | None = None
@@ -251,7 +248,9 @@ class FrameTracker:
         self, leader: int, row: int, images: tuple[Pyramid, Pyramid], tracks: LiveTracks
     ) -> tuple[LiveTracks, StereoMatches]:
         """Find the tracks of the leader in a camera; return these with distances, and the matches."""
-        matches = match(self._views[leader], self._views[row], images, tracks, self._stereo)
+        matches = match(
+            self._views[leader], self._views[row], images, tracks, self._options, self._flow
+        )
         is_known = np.isfinite(matches.distance_m)
         distance = np.where(is_known, matches.distance_m, tracks.distance_m)
         return dataclasses.replace(tracks, distance_m=distance), matches
@@ -371,15 +370,6 @@ _RETRY_FRAMES = 4
 """Interval in which a point of unknown distance is sought again."""
 
 
-@dataclasses.dataclass(frozen=True)
-class StereoOptions:
-    """Limits of stereo."""
-
-    flow: FlowOptions
-    gate_px: float  # distance to the epipolar line
-    distance_m: float  # where the points are sought while no distance is known
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class StereoMatches:
     """M observations of K tracks by another camera."""
@@ -401,7 +391,8 @@ def match(
     second: CameraView,
     images: tuple[Pyramid, Pyramid],
     tracks: LiveTracks,
-    options: StereoOptions,
+    options: TrackingOptions,
+    flow: FlowOptions,
 ) -> StereoMatches:
     """Find the tracks of a camera in the image that another took at the same time.
 
@@ -411,15 +402,17 @@ def match(
     """
     R_A_B, p_A_B = first.R_I_C.T @ second.R_I_C, first.R_I_C.T @ (second.p_I_C - first.p_I_C)
     expected_m = np.empty(len(tracks))
-    stereo_kernels.expect_distances(tracks.uv, tracks.distance_m, options.distance_m, expected_m)
+    stereo_kernels.expect_distances(
+        tracks.uv, tracks.distance_m, options.stereo_distance_m, expected_m
+    )
     guess, visible = second.pixels((expected_m[:, None] * tracks.ray - p_A_B) @ R_A_B)
     is_due = np.isfinite(tracks.distance_m) | (tracks.num_frames % _RETRY_FRAMES == 1)
     rows = np.flatnonzero(is_due & visible & second.is_usable(guess))
     is_near = np.isfinite(tracks.distance_m[rows])
-    uv, is_match = follow(*images, tracks.uv[rows], guess[rows], options.flow, is_near)
+    uv, is_match = follow(*images, tracks.uv[rows], guess[rows], flow, is_near)
     ray, exists = second.rays(uv)
     is_match &= exists & second.is_usable(uv)
-    gate, distance_m = options.gate_px / second.focal_px, np.full(len(tracks), np.nan)
+    gate, distance_m = options.epipolar_gate_px / second.focal_px, np.full(len(tracks), np.nan)
     of_rows = np.empty(len(rows))
     stereo_kernels.check_matches(tracks.ray[rows], ray @ R_A_B.T, p_A_B, gate, is_match, of_rows)
     distance_m[rows] = of_rows
