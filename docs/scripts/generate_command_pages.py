@@ -46,25 +46,23 @@ def pages(registry: Registry) -> dict[str, str]:
 
 def decisions() -> str:
     """Return the list of decision records."""
-    lines = ["# Decisions\n", _NOTE]
-    lines += ["Choices that would be costly to reverse, why, and what was rejected.\n"]
-    for path in sorted(DECISIONS.glob("0*.md")):
-        title = path.read_text(encoding="utf-8").splitlines()[0].lstrip("# ")
-        lines.append(f"- [{title}]({path.name})")
-    return "\n".join(lines) + "\n"
+    purpose = "Choices that would be costly to reverse, why, and what was rejected."
+    return _titles_below(DECISIONS, "Decisions", purpose)
 
 
 def studies() -> str:
-    """Return the list of studies, each with the question that it answers."""
-    lines = ["# Studies\n", _NOTE]
-    lines += ["Experiments behind the decisions: question, answer, limits, figures.\n"]
-    for path in sorted(STUDIES.glob("*.md")):
-        if path.name == "index.md":
-            continue
-        text = path.read_text(encoding="utf-8")
-        title = text.splitlines()[0].lstrip("# ")
-        question = text.split("**Question.** ", 1)[1].split("?", 1)[0] + "?"
-        lines.append(f"- [{title}]({path.name}): {' '.join(question.split())}")
+    """Return the list of studies."""
+    return _titles_below(
+        STUDIES, "Studies", "Experiments behind the decisions: question, answer, limits, figures."
+    )
+
+
+def _titles_below(folder: Path, heading: str, purpose: str) -> str:
+    lines = [f"# {heading}\n", _NOTE, f"{purpose}\n"]
+    for path in sorted(folder.glob("*.md")):
+        if path.name != "index.md":
+            title = path.read_text(encoding="utf-8").splitlines()[0].lstrip("# ")
+            lines.append(f"- [{title}]({path.name})")
     return "\n".join(lines) + "\n"
 
 
