@@ -228,7 +228,7 @@ def _halve(folder: Path, device: Any) -> None:
         gyro_bias_random_walk_noise_density=2e-5,
     )
     rig = dataclasses.replace(device.rig, cameras=(smaller,), T_B_C=device.rig.T_B_C[:1])
-    changed = device.with_imu(imu)
+    changed = device.with_sensor(imu)
     sensors = {**changed.sensors.sensors, rig.id: rig}
     changed = dataclasses.replace(
         changed, sensors=dataclasses.replace(changed.sensors, sensors=sensors)

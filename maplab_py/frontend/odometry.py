@@ -313,7 +313,7 @@ class Odometry:
         self._imu, notes = imu_noise.plausible_noise(self._imu, *self._backfiller.waiting.samples())
         if notes:
             self.notes += notes
-            self._device = self._device.with_imu(self._imu)
+            self._device = self._device.with_sensor(self._imu)
             self._starter = self._make_starter(self._device)
             if isinstance(self._starter, initializer.Initializer):
                 self._starter.replace_frames(frames[:-1])

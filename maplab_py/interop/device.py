@@ -51,21 +51,16 @@ class RecordedSensors:
         """Return the same sensors with another calibration of the cameras, poses (C, 7) on the IMU."""
         T_I_B = self.sensors.T_I_S(self.imu_id, self.rig_id)
         T_B_C = se3.compose(se3.inverse(T_I_B), T_I_C)
-        return self.with_rig(dataclasses.replace(self.rig, cameras=cameras, T_B_C=T_B_C))
+        return self.with_sensor(dataclasses.replace(self.rig, cameras=cameras, T_B_C=T_B_C))
 
-    def with_rig(self, rig: CameraRig) -> RecordedSensors:
-        """Return the same sensors with another calibration of the rig under its id."""
-        known = dataclasses.replace(self.sensors, sensors={**self.sensors.sensors, rig.id: rig})
-        return dataclasses.replace(self, sensors=known)
+    def with_sensor(self, sensor: CameraRig | Imu) -> RecordedSensors:
+        """Return the same sensors with another calibration of the rig or the IMU under its id."""
+        known = {**self.sensors.sensors, sensor.id: sensor}
+        return dataclasses.replace(self, sensors=dataclasses.replace(self.sensors, sensors=known))
 
     def renamed(self) -> RecordedSensors:
         """Return the same sensors under ids that follow from their calibration."""
         return make_device(self.cameras, self.T_I_C, self.imu, self.notes)
-
-    def with_imu(self, imu: Imu) -> RecordedSensors:
-        """Return the same sensors with other figures of the IMU."""
-        known = dataclasses.replace(self.sensors, sensors={**self.sensors.sensors, imu.id: imu})
-        return dataclasses.replace(self, sensors=known)
 
 
 class DeviceOptions(Options, prefix="selected_"):
@@ -180,7 +175,7 @@ def at_middle_rows(device: RecordedSensors) -> RecordedSensors:
         f"images count at the time of their middle row, {1e-6 * shift_ns:+.3f} ms by the calibration; "
         "--imu_to_camera_time_offset_ns is the offset of that row"
     )
-    known = device.with_rig(dataclasses.replace(device.rig, cameras=tuple(moved)))
+    known = device.with_sensor(dataclasses.replace(device.rig, cameras=tuple(moved)))
     return dataclasses.replace(known, notes=(*device.notes, note))
 
 
@@ -189,7 +184,7 @@ def with_time_offset(device: RecordedSensors, offset_ns: int) -> RecordedSensors
     cameras = tuple(
         dataclasses.replace(camera, time_offset_ns=offset_ns) for camera in device.rig.cameras
     )
-    return device.with_rig(dataclasses.replace(device.rig, cameras=cameras))
+    return device.with_sensor(dataclasses.replace(device.rig, cameras=cameras))
 
 
 def _camera_id(camera: Camera) -> str:

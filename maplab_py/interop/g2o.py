@@ -16,7 +16,7 @@ from maplab_py.array_types import F64, I64, U64
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
 from maplab_py.input_files import TooLarge, decode_foreign, inflate, read_bytes
-from maplab_py.interop.text_table import format_rows
+from maplab_py.interop.text_table import format_rows, is_number
 from maplab_py.output_files import write_text
 
 
@@ -267,19 +267,22 @@ def _numbers(
         rows = [[float(word) for word in words[1 + ids :]] for _, words in lines]
     except ValueError:
         for number, words in lines:
-            _check_numbers(number, words[1 + ids :], path)
+            for word in words[1 + ids :]:
+                if not is_number(word):
+                    raise MapError(f"{path}:{number}: '{word}' is not a number") from None
         raise
     values = np.array(rows, dtype=np.float64).reshape(-1, _WIDTH[kind] - ids)
-    wrong = np.flatnonzero(~np.isfinite(values).all(axis=1))
-    if len(wrong):
-        raise MapError(f"{path}:{lines[wrong[0]][0]}: a value is not a finite number")
-    wrong = np.flatnonzero((np.abs(values) > _LARGEST).any(axis=1))
-    if len(wrong):
-        raise MapError(f"{path}:{lines[wrong[0]][0]}: a value is beyond {_LARGEST:g}")
+    size = np.abs(values)
+    problems = [
+        (~np.isfinite(values).all(axis=1), "a value is not a finite number"),
+        ((size > _LARGEST).any(axis=1), f"a value is beyond {_LARGEST:g}"),
+    ]
     if kind in (_POSE, _EDGE):
-        wrong = np.flatnonzero(np.abs(values[:, 3:7]).max(axis=1, initial=0.0) < 1.0 / _LARGEST)
-        if len(wrong):
-            raise MapError(f"{path}:{lines[wrong[0]][0]}: the quaternion is zero")
+        is_zero = size[:, 3:7].max(axis=1, initial=0.0) < 1.0 / _LARGEST
+        problems.append((is_zero, "the quaternion is zero"))
+    for wrong, problem in problems:
+        if wrong.any():
+            raise MapError(f"{path}:{lines[int(np.argmax(wrong))][0]}: {problem}")
     return _ids(lines, ids, path).reshape(-1, ids), values
 
 
@@ -296,14 +299,6 @@ def _ids(lines: list[tuple[int, list[str]]], count: int | None, path: Path) -> U
                         f"{path}:{number}: '{word}' is not an id: wants 64 bits without sign"
                     ) from None
         raise
-
-
-def _check_numbers(number: int, words: list[str], path: Path) -> None:
-    for word in words:
-        try:
-            float(word)
-        except ValueError:
-            raise MapError(f"{path}:{number}: '{word}' is not a number") from None
 
 
 def _pose(values: F64) -> F64:

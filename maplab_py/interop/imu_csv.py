@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -104,4 +105,4 @@ def write_imu_csv(recording: ImuRecording, path: Path, *, overwrite: bool = Fals
     """
     values = recording.accel_gyro[:, [3, 4, 5, 0, 1, 2]]
     rows = text_table.format_rows("%d" + ",%.17g" * 6, [recording.times_ns, values])
-    write_text(path, (text for part in ([_HEADER], rows) for text in part), overwrite=overwrite)
+    write_text(path, chain([_HEADER], rows), overwrite=overwrite)

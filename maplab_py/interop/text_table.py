@@ -252,7 +252,7 @@ def _data_lines(text: str) -> tuple[list[str], list[int], list[str], bool]:
         if (has_dates or not lines) and (date := _DATE.match(line)) is not None:
             has_dates, line = True, date["before"] + _seconds(date) + line[date.end() :]
         if line.startswith(("#", "%")) or (
-            not lines and not _is_number(_split(line.replace(";", ","))[0])
+            not lines and not is_number(_split(line.replace(";", ","))[0])
         ):
             others.append(line)
             continue
@@ -357,7 +357,7 @@ def _numeric(header: tuple[str, ...], rows: list[list[str]], where: str) -> list
         MapError: There is text, and not each column has a name.
     """
     if len(header) != len(rows[0]):
-        texts = [cell for cell in rows[0] if cell and not _is_number(cell)]
+        texts = [cell for cell in rows[0] if cell and not is_number(cell)]
         if texts:
             raise MapError(
                 f"{where}: '{texts[0]}' is no number: a column of text is left out where a header names each "
@@ -369,7 +369,7 @@ def _numeric(header: tuple[str, ...], rows: list[list[str]], where: str) -> list
     return [
         k
         for k, (name, cell) in named
-        if k == 0 or _QUANTITY.search(name) or (_is_number(cell) and not _ID.search(name))
+        if k == 0 or _QUANTITY.search(name) or (is_number(cell) and not _ID.search(name))
     ]
 
 
@@ -386,7 +386,8 @@ def _cells(line: str) -> list[str]:
     return [cell.strip() for cell in line.split(",")]
 
 
-def _is_number(cell: str) -> bool:
+def is_number(cell: str) -> bool:
+    """Return whether a cell is a number, also an infinite one or NaN."""
     try:
         float(cell)
     except ValueError:
@@ -420,7 +421,7 @@ def _parse_values(rows: list[list[str]], source: str, numbers: list[int], allow_
                 value = float(token)
             except ValueError:
                 value = np.nan
-            if not abs(value) <= LARGEST and not (allow_nan and _is_number(token)):
+            if not abs(value) <= LARGEST and not (allow_nan and is_number(token)):
                 reason = (
                     f"is beyond {LARGEST:g}" if np.isfinite(value) else "is not a finite number"
                 )

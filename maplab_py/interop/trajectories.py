@@ -6,6 +6,7 @@ three rows of a homogeneous matrix, row by row, with the time stamps in a file o
 
 import dataclasses
 import re
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -202,9 +203,7 @@ def read_kitti(path: Path, times_file: Path, time_unit: str = "") -> Trajectory:
         raise MapError(f"{path}: pose {wrong[0] + 1} is no rotation and position")
     if np.any(np.diff(times_ns) < 0):
         raise MapError(f"{times_file}: the time stamps are not in the order of time")
-    homogeneous = np.tile(np.eye(4), (len(R), 1, 1))
-    homogeneous[:, :3] = matrices
-    T_R_B = se3.from_matrix(homogeneous)
+    T_R_B = se3.make(so3.from_matrix(R), matrices[:, :, 3])
     return Trajectory(times_ns, T_R_B, source=str(path), note=stamps.note)
 
 
@@ -248,9 +247,7 @@ def write_euroc(trajectory: Trajectory, path: Path, *, overwrite: bool = False) 
     if len(given) == 3:
         columns, header, width = [*columns, *given], header + _EUROC_STATE_HEADER, 16
     rows = text_table.format_rows("%d" + ",%.17g" * width, columns)
-    write_text(
-        path, (text for part in ([header + "\n"], rows) for text in part), overwrite=overwrite
-    )
+    write_text(path, chain([header + "\n"], rows), overwrite=overwrite)
 
 
 def _columns(table: text_table.TextTable) -> dict[str, int]:

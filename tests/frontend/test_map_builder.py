@@ -128,7 +128,7 @@ def test_missions_keep_their_sensors_unless_the_ids_are_the_same(
     two, used = make_map(), []
     device = MapRecording(two, 0).device
     assert device.imu is not None
-    noisy = device.with_imu(dataclasses.replace(device.imu, gyro_noise_density=0.5))
+    noisy = device.with_sensor(dataclasses.replace(device.imu, gyro_noise_density=0.5))
     noisy = noisy.renamed() if is_renamed else noisy
     builder = MapBuilder(device, OFTEN)
     rebuilt(two, builder, 0)

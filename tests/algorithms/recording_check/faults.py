@@ -115,7 +115,7 @@ def with_noise_figures(recording: protocol.Recording, accel: float, gyro: float)
         acc_noise_density=accel * imu.acc_noise_density,
         gyro_noise_density=gyro * imu.gyro_noise_density,
     )
-    return FaultyRecording(recording, recording.device.with_imu(changed))
+    return FaultyRecording(recording, recording.device.with_sensor(changed))
 
 
 def with_rig(

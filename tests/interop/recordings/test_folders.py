@@ -121,7 +121,7 @@ def test_images_count_at_the_time_of_their_middle_row(
         dataclasses.replace(c, image_delay_s=s, time_offset_ns=3_000_000, line_delay_ns=line_ns)
         for c, s in zip(device.cameras, delays_s, strict=True)
     ]
-    given = device.with_rig(dataclasses.replace(device.rig, cameras=tuple(late)))
+    given = device.with_sensor(dataclasses.replace(device.rig, cameras=tuple(late)))
     file = tmp_path / "sensors.yaml"
     file.write_text(write_sensors(given.sensors))
     opened = open_recording(folder, SourceOptions(file)).device
