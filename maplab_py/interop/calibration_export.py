@@ -12,6 +12,7 @@ import yaml
 from maplab_py.array_types import F64, NDArray
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
+from maplab_py.interop.calibrations import models
 from maplab_py.sensors import Camera, Distortion, Imu, Projection, SensorSet, sensors_yaml
 from maplab_py.sensors.camera import DISTORTION_NAMES, MIRROR_NAMES
 from maplab_py.sensors.imu import ImuIntrinsics
@@ -62,50 +63,26 @@ def _known(imu: Imu) -> ImuIntrinsics:
     return imu.intrinsics or ImuIntrinsics()
 
 
-def _rows(matrix: NDArray[Any]) -> list[list[float]]:
-    return [[float(value) for value in row] for row in matrix]
-
-
-def _matrix(T: F64) -> F64:
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = so3.to_matrix(T[:4]), T[4:]
-    return matrix
-
-
 def _time_shift_s(camera: Camera) -> float:
     """Return t_imu - t_camera [s]."""
     return camera.time_offset_ns * 1e-9 + camera.image_delay_s
 
 
-_PROJECTION_NAMES = {
-    Projection.PINHOLE: "pinhole",
-    Projection.UNIFIED: "omni",
-    Projection.DOUBLE_SPHERE: "ds",
-    Projection.EXTENDED_UNIFIED: "eucm",
-}
-_DISTORTION_NAMES = {
-    Distortion.RADTAN: "radtan",
-    Distortion.EQUIDISTANT: "equidistant",
-    Distortion.FOV: "fov",
-    Distortion.NONE: "none",
-}
-
-
 def _chain(cameras: tuple[Camera, ...], T_imu_C: F64) -> dict[str, Any]:
     chain: dict[str, Any] = {}
     for row, camera in enumerate(cameras):
-        name = _DISTORTION_NAMES.get(camera.distortion)
-        if name is None:
+        name = models.kalibr_name(models.DISTORTIONS, camera.distortion)
+        if not name:
             raise UserError(
                 f"kalibr and OpenVINS have no {camera.distortion.value} distortion: maplab and basalt have it"
             )
         chain[f"cam{row}"] = {
-            "T_cam_imu": _rows(np.linalg.inv(_matrix(T_imu_C[row]))),
+            "T_cam_imu": np.linalg.inv(se3.to_matrix(T_imu_C[row])).tolist(),
             "cam_overlaps": [other for other in range(len(cameras)) if other != row],
-            "camera_model": _PROJECTION_NAMES[camera.projection],
-            "distortion_coeffs": [float(value) for value in camera.distortion_parameters],
+            "camera_model": models.kalibr_name(models.PROJECTIONS, camera.projection),
+            "distortion_coeffs": camera.distortion_parameters.tolist(),
             "distortion_model": name,
-            "intrinsics": [float(value) for value in camera.intrinsics],
+            "intrinsics": camera.intrinsics.tolist(),
             "resolution": [camera.width_px, camera.height_px],
             "rostopic": camera.topic or f"/cam{row}/image_raw",
             "timeshift_cam_imu": _time_shift_s(camera),
@@ -138,11 +115,15 @@ def _kalibr(imu: Imu, cameras: tuple[Camera, ...], T_I_C: F64, rate_hz: float) -
     M_g, C_gyro_i = lower_triangular(known.T_g @ R_i_I.T)
     T_i_I = se3.make(so3.from_matrix(R_i_I), np.zeros(3))
     entry = {
-        "T_i_b": _rows(np.eye(4)),
+        "T_i_b": np.eye(4).tolist(),
         **_noise(imu, rate_hz),
         "model": "scale-misalignment",
-        "accelerometers": {"M": _rows(M_a)},
-        "gyroscopes": {"M": _rows(M_g), "A": _rows(np.zeros((3, 3))), "C_gyro_i": _rows(C_gyro_i)},
+        "accelerometers": {"M": M_a.tolist()},
+        "gyroscopes": {
+            "M": M_g.tolist(),
+            "A": np.zeros((3, 3)).tolist(),
+            "C_gyro_i": C_gyro_i.tolist(),
+        },
     }
     return {
         "camchain-imucam.yaml": _yaml(_chain(cameras, se3.compose(T_i_I, T_I_C))),
@@ -161,14 +142,14 @@ def _openvins(imu: Imu, cameras: tuple[Camera, ...], T_I_C: F64, rate_hz: float)
             )
     known = _known(imu)
     entry = {
-        "T_i_b": _rows(np.eye(4)),
+        "T_i_b": np.eye(4).tolist(),
         **_noise(imu, rate_hz),
         "model": "rpng",
-        "Tw": _rows(known.T_g),
-        "R_IMUtoGYRO": _rows(np.eye(3)),
-        "Ta": _rows(known.T_a),
-        "R_IMUtoACC": _rows(known.R_A_I),
-        "Tg": _rows(np.zeros((3, 3))),
+        "Tw": known.T_g.tolist(),
+        "R_IMUtoGYRO": np.eye(3).tolist(),
+        "Ta": known.T_a.tolist(),
+        "R_IMUtoACC": known.R_A_I.tolist(),
+        "Tg": np.zeros((3, 3)).tolist(),
     }
     head = "%YAML:1.0\n\n"
     return {

@@ -19,7 +19,7 @@ PROJECTIONS = {
     "ds": Projection.DOUBLE_SPHERE,
     "eucm": Projection.EXTENDED_UNIFIED,
 }
-_DISTORTIONS = {
+DISTORTIONS = {
     "none": Distortion.NONE,
     "radtan": Distortion.RADTAN,
     "radial-tangential": Distortion.RADTAN,
@@ -36,7 +36,7 @@ _DISTORTIONS = {
     "kannalabrandt8": Distortion.EQUIDISTANT,
     "fov": Distortion.FOV,
 }
-"""Names of distortion models; the count of coefficients tells the polynomial ones apart."""
+"""Names of models, kalibr's first; the count of coefficients tells the polynomial distortions apart."""
 _BY_COUNT = {4: Distortion.RADTAN, 5: Distortion.RADTAN5, 8: Distortion.RATIONAL}
 _MAX_TIME_SHIFT_S = 10.0
 _NOISE_FIELDS = (
@@ -72,7 +72,7 @@ def make_camera(
         MapError: A model is not supported, or a number is wrong.
     """
     shape = _named(entry, *projection, PROJECTIONS)
-    lens = _named(entry, *distortion, _DISTORTIONS)
+    lens = _named(entry, *distortion, DISTORTIONS)
     values, numbers = np.array(coefficients, dtype=float), np.array(intrinsics, dtype=float)
     if lens is Distortion.RADTAN:
         lens, values = _polynomial(entry, distortion[0], values)
@@ -96,6 +96,11 @@ def make_camera(
 
 def _is_size(value: float) -> bool:
     return 1 <= value < 1 << 20 and value == round(value)
+
+
+def kalibr_name(names: Mapping[str, Any], model: Projection | Distortion) -> str:
+    """Return the name of a model in kalibr, empty if it has none."""
+    return next((name for name, known in names.items() if known is model), "")
 
 
 def _named(entry: Entry, key: str, name: str, kinds: dict[str, Any]) -> Any:
@@ -133,7 +138,7 @@ def read_camera(entry: Entry, distortion_key: str, **more: Any) -> Camera:
     model = entry.text("camera_model", default="pinhole")
     lens = entry.text("distortion_model", default="none")
     _named(entry, "camera_model", model, PROJECTIONS)
-    lens_model = _named(entry, "distortion_model", lens, _DISTORTIONS)
+    lens_model = _named(entry, "distortion_model", lens, DISTORTIONS)
     coefficients: F64 = np.zeros(0)
     if lens_model is not Distortion.NONE or distortion_key in entry:
         coefficients = entry.numbers(distortion_key)
