@@ -58,7 +58,7 @@ def run(cameras: int, noise_px: float) -> Standing:
             updates = odometry.push_imu(event)
         else:
             assert isinstance(event, TrackedFrameSet)
-            updates = odometry.push_tracks(event)
+            updates = odometry.push_frames(event)
         for update in updates:
             time_s = (update.time_ns - recording.start_ns) * 1e-9
             is_in_stop = abs(time_s - _WALK_S - 0.5 * _STOP_S) < 0.5 * _STOP_S - _SPEED_CHANGES_S

@@ -103,7 +103,7 @@ def pushed(odometry: Odometry, event: Event) -> tuple[list[OdometryUpdate], list
         updates = odometry.push_imu(event)
     else:
         assert isinstance(event, TrackedFrameSet)
-        updates = odometry.push_tracks(event)
+        updates = odometry.push_frames(event)
     spent_ms = 1e3 * (time.process_time() - began)
     return updates, [spent_ms / len(updates) for _ in updates]
 

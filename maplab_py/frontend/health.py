@@ -48,30 +48,17 @@ class HealthMonitor:
         blind_s = (time_ns - self._tracked_ns) * 1e-9
         if blind_s > options.max_time_without_tracks_s:
             return f"fewer than {options.min_tracks} keypoints tracked for {blind_s:.1f} s"
-        speed = float(np.linalg.norm(state.v_M))
         sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+        velocity_sigma, tilt_deg = sigma[_VELOCITY].max(), np.degrees(sigma[_TILT].max())
+        vectors = (state.v_M, state.accel_bias, state.gyro_bias)
+        speed, accel_bias, gyro_bias = (float(np.linalg.norm(vector)) for vector in vectors)
+        deviation = "standard deviation of the"
         checks = (
             (speed, options.max_speed, "speed {:.1f} m/s"),
-            (
-                float(sigma[_VELOCITY].max()),
-                options.max_velocity_sigma,
-                "standard deviation of the velocity {:.2f} m/s",
-            ),
-            (
-                float(np.degrees(sigma[_TILT].max())),
-                options.max_tilt_sigma_deg,
-                "standard deviation of the tilt {:.1f} deg",
-            ),
-            (
-                float(np.linalg.norm(state.accel_bias)),
-                options.max_accel_bias,
-                "bias of the accelerometer {:.2f} m/s^2",
-            ),
-            (
-                float(np.linalg.norm(state.gyro_bias)),
-                options.max_gyro_bias,
-                "bias of the gyroscope {:.2f} rad/s",
-            ),
+            (velocity_sigma, options.max_velocity_sigma, f"{deviation} velocity {{:.2f}} m/s"),
+            (tilt_deg, options.max_tilt_sigma_deg, f"{deviation} tilt {{:.1f}} deg"),
+            (accel_bias, options.max_accel_bias, "bias of the accelerometer {:.2f} m/s^2"),
+            (gyro_bias, options.max_gyro_bias, "bias of the gyroscope {:.2f} rad/s"),
         )
         for value, limit, text in checks:
             if not value <= limit:

@@ -191,9 +191,7 @@ class Mapping:
             if read.imu.count >= _ZERO_SAMPLES and read.zero_note:
                 raise UserError(f"{self._recording.name}: {read.zero_note}")
             return self.odometry.push_imu(event)
-        if isinstance(event, protocol.FrameSet):
-            return self.odometry.push_images(event)
-        return self.odometry.push_tracks(event)
+        return self.odometry.push_frames(event)
 
     def _take(self, update: OdometryUpdate, progress: Progress) -> None:
         """Use the result of a frame."""

@@ -116,17 +116,26 @@ class Odometry:
         self._buffer.push(batch)
         return self._process_waiting()
 
-    def push_images(self, frame_set: FrameSet) -> list[OdometryUpdate]:
-        """Take the images of a frame set; return updates, mostly its own.
+    def push_frames(self, frame_set: FrameSet | TrackedFrameSet) -> list[OdometryUpdate]:
+        """Take the images of a frame set, or tracked keypoints; return updates, mostly its own.
 
         Raises:
             MapError: Times do not increase, there are no IMU samples, or an image cannot be read.
         """
-        return self._push(frame_set)
-
-    def push_tracks(self, frame_set: TrackedFrameSet) -> list[OdometryUpdate]:
-        """Take tracked keypoints in place of images; see `push_images`."""
-        return self._push(frame_set)
+        if frame_set.time_ns <= self._newest_ns:
+            raise MapError(
+                f"the frame at {frame_set.time_ns} ns does not come after the frame at "
+                f"{self._newest_ns} ns: send frames in the order of their stamps, each once"
+            )
+        self._newest_ns = frame_set.time_ns
+        self._waiting.append(frame_set)
+        updates = self._process_waiting()
+        if len(self._waiting) > _MAX_WAITING:
+            raise MapError(
+                f"there are {len(self._waiting)} frames after the last IMU sample: check that the "
+                "IMU is recorded, and that the clocks of cameras and IMU agree"
+            )
+        return updates
 
     @property
     def waiting_frames(self) -> int:
@@ -192,22 +201,6 @@ class Odometry:
         return NavState.of_motion(smoother.times_ns, states.T_M_I, states.motion)
 
     # -- frames -----------------------------------------------------------------------------------
-
-    def _push(self, frame_set: FrameSet | TrackedFrameSet) -> list[OdometryUpdate]:
-        if frame_set.time_ns <= self._newest_ns:
-            raise MapError(
-                f"the frame at {frame_set.time_ns} ns does not come after the frame at "
-                f"{self._newest_ns} ns: send frames in the order of their stamps, each once"
-            )
-        self._newest_ns = frame_set.time_ns
-        self._waiting.append(frame_set)
-        updates = self._process_waiting()
-        if len(self._waiting) > _MAX_WAITING:
-            raise MapError(
-                f"there are {len(self._waiting)} frames after the last IMU sample: check that the "
-                "IMU is recorded, and that the clocks of cameras and IMU agree"
-            )
-        return updates
 
     def _process_waiting(self) -> list[OdometryUpdate]:
         updates = []

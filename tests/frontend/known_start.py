@@ -56,4 +56,4 @@ def updates_of(odometry: Odometry, events: Iterable[Event]) -> Iterator[Odometry
             yield from odometry.push_imu(event)
         else:
             assert isinstance(event, TrackedFrameSet)
-            yield from odometry.push_tracks(event)
+            yield from odometry.push_frames(event)

@@ -282,7 +282,7 @@ def test_wrong_order_is_refused_and_what_was_estimated_stays() -> None:
     updates = pushed(odometry, events[:40])
     frame = next(e for e in reversed(events[:40]) if isinstance(e, TrackedFrameSet))
     with pytest.raises(MapError, match=r"does not come after the frame .* in the order"):
-        odometry.push_tracks(frame)
+        odometry.push_frames(frame)
     batch = next(e for e in reversed(events[:40]) if isinstance(e, ImuBatch))
     with pytest.raises(MapError, match=r"does not come after the sample .* in the order"):
         odometry.push_imu(batch)

@@ -260,16 +260,16 @@ class FixedLagSmoother:
 
     def _see(self, frame: WindowFrame) -> None:
         """Add the observations of the newest frame."""
-        nothing = np.zeros(len(frame.camera), dtype=np.int64)
-        rays, valid = self._rays(frame.camera, frame.uv_px, nothing - 1)
+        number = len(self._states) - 1
+        newest = np.full(len(frame.camera), number, dtype=np.int64)
+        rays, valid = self._rays(frame.camera, frame.uv_px, newest)
         seen = Observations(
-            nothing, nothing.astype(np.int32), frame.camera.astype(np.int32),
+            newest, newest.astype(np.int32), frame.camera.astype(np.int32),
             np.asarray(frame.uv_px, dtype=np.float64),
             np.asarray(frame.sigma_px, dtype=np.float64), rays,
         )  # fmt: skip
-        self.tracks.add(
-            len(self._states) - 1, frame.track_id[valid].astype(np.int64), seen.take(valid)
-        )
+        track_id = frame.track_id[valid].astype(np.int64)
+        self.tracks.add(range(number, number + 1), track_id, seen.take(valid))
 
     def _rays(self, camera: I32, uv_px: F64, frame: I64) -> tuple[F64, Mask]:
         """Return unit rays (N, 3) of pixels at the times of their frames (N,), and whether they exist."""

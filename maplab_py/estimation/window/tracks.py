@@ -63,18 +63,13 @@ class Tracks:
         """Rows of the tracks that are landmarks."""
         return np.flatnonzero(self.is_landmark)
 
-    def add(self, frame: int, track_id: I64, seen: Observations) -> None:
-        """Add the observations of a new frame; `seen.row` and `seen.frame` need not be set."""
-        rows = np.full(len(track_id), frame, dtype=np.int32)
-        self.add_frames(range(frame, frame + 1), rows, track_id, seen)
-
-    def add_frames(self, frames: range, frame: I32, track_id: I64, seen: Observations) -> None:
-        """Add the observations of consecutive new frames, with the frame (O,) of each, ascending."""
+    def add(self, frames: range, track_id: I64, seen: Observations) -> None:
+        """Add the observations of consecutive new frames; `seen.row` need not be set."""
         self._insert(self._unknown(track_id))
         row = np.searchsorted(self.id, track_id)
-        self.last_seen[row] = self._clock + 1 + frame - frames.start
+        self.last_seen[row] = self._clock + 1 + seen.frame - frames.start
         self._clock += len(frames)
-        new = dataclasses.replace(seen, row=row, frame=frame).take(~self.is_closed[row])
+        new = dataclasses.replace(seen, row=row).take(~self.is_closed[row])
         self.observations = Observations.concatenate([self.observations, new])
 
     def replace_rays(self, ray_C: F64) -> None:

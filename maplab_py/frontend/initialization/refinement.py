@@ -265,7 +265,7 @@ class Refinement:
         """Return tracks with landmarks triangulated."""
         rows, seen = observed
         tracks = Tracks()
-        tracks.add_frames(range(len(segment)), seen.frame, segment.track_id[rows], seen)
+        tracks.add(range(len(segment)), segment.track_id[rows], seen)
         counts = tracks.counts()
         candidates = np.flatnonzero(counts >= 2)
         candidates = candidates[np.argsort(-counts[candidates], kind="stable")]
