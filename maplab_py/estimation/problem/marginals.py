@@ -14,9 +14,8 @@ from maplab_py.errors import EstimationError
 from maplab_py.estimation.kernels.loss import loss_and_weight
 from maplab_py.estimation.linear import protocol, threads
 from maplab_py.estimation.problem.problem import Problem
-from maplab_py.estimation.states import States, pose_nodes
+from maplab_py.estimation.states import States
 from maplab_py.estimation.terms.visual import VisualTerms
-from maplab_py.geometry import se3, so3
 
 _LANDMARK_DAMPING = 1e-12
 """Relative damping of landmarks' own 3 x 3 systems: those without parallax stay solvable."""
@@ -88,27 +87,6 @@ class Marginals:
         first = np.minimum(data.start[:-1], len(data) - 1)
         count = len(self._states.T_G_I)
         return np.asarray(data.vertex[first].astype(np.int64) * _STRETCHES // max(count, 1))
-
-    def poses(self, vertices: ArrayLike) -> F64:
-        """Return the covariances (N, 6, 6) of poses: position in G [m^2], rotation in I [rad^2]."""
-        rows = np.asarray(vertices, dtype=np.int64).reshape(-1)
-        result = np.empty((len(rows), 6, 6))
-        for chunk in np.array_split(np.arange(len(rows)), max(1, len(rows) // 64)):
-            joint = self.nodes(pose_nodes(rows[chunk]))
-            local = np.arange(6 * len(chunk)).reshape(-1, 6)
-            result[chunk] = joint[local[:, :, None], local[:, None, :]]
-        return result
-
-    def relative_pose(self, first: int, second: int) -> F64:
-        """Return the covariance (6, 6) of T_A_B: position in A, rotation in B."""
-        joint = self.nodes(pose_nodes(np.array([first, second])))
-        T_A_B = se3.relative(self._states.T_G_I[first], self._states.T_G_I[second])
-        R_A_G = so3.to_matrix(self._states.T_G_I[first, :4]).T
-        J = np.zeros((6, 12))
-        J[:3, :3], J[:3, 6:9] = -R_A_G, R_A_G
-        J[:3, 3:6] = so3.skew(T_A_B[4:])
-        J[3:, 3:6], J[3:, 9:] = -so3.to_matrix(T_A_B[:4]).T, np.eye(3)
-        return np.asarray(J @ joint @ J.T)
 
 
 # Cluster-robust covariance: errors may be correlated within a track, or for some time (decision 18).

@@ -192,17 +192,6 @@ class WindowCalibration:
         turn = so3.exp(self.lateness_s(camera, uv_px, delay_s, now)[:, None] * rate_I)
         return so3.rotate(so3.inverse(q_I_C), so3.rotate(turn, so3.rotate(q_I_C, rays_C)))
 
-    def rows(self, kind: str) -> I64:
-        """Return the states (k,) of a kind."""
-        first, last = {
-            "extrinsics": (0, CAMERA_DELAY_COLUMN),
-            "time_offset": (CAMERA_DELAY_COLUMN, CAMERA_DELAY_COLUMN + 1),
-            "line_delay": (CAMERA_DELAY_COLUMN + 1, CAMERA_DELAY_COLUMN + 2),
-            "intrinsics": (CAMERA_INTRINSICS_COLUMN, self.columns.shape[1]),
-        }[kind]
-        columns = np.unique(self.columns[:, first:last])
-        return columns[columns >= 0]
-
     def units(self) -> list[tuple[float, str]]:
         """Return by what each of the states (K) is multiplied to be shown, and its unit."""
         return [_unit_of(name) for name in self.names()]

@@ -51,11 +51,6 @@ class MapTracks:
     def __len__(self) -> int:
         return len(self.matches)
 
-    @property
-    def estimates_landmarks(self) -> bool:
-        """Whether landmarks are states with a prior from the map."""
-        return self.matches.covariance_G is not None
-
     def includes(self, track_id: I64) -> Mask:
         """Tell which tracks (N,) are associated."""
         return np.isin(track_id, self.matches.track_id)

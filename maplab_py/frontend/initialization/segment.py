@@ -52,11 +52,6 @@ class Segment(ObservedFrames):
     inertial: InertialData  # (F - 1) edges
     between: ObservedFrames  # at times of inertial samples
 
-    @property
-    def duration_s(self) -> float:
-        """Time from the first to the last frame."""
-        return float(self.time_ns[-1] - self.time_ns[0]) * 1e-9
-
     def samples(self, edge: int) -> tuple[I64, F64]:
         """Return times (S,) and samples (S, 6) of an edge."""
         rows = slice(*self.inertial.sample_start[edge : edge + 2].tolist())

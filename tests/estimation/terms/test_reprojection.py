@@ -182,7 +182,7 @@ def test_window_jacobians_by_the_calibration_and_of_late_rows_are_those_of_diffe
         at = WindowPoint(poses, h[None], cameras, late)
         window_kernels().eliminate(data, at, rule, system, kept)
         frames = system.gradient[: 2 * FRAME_SIZE].reshape(2, FRAME_SIZE)[:, :6]
-        line = calibration.rows("line_delay")
+        line = [row for row, name in enumerate(calibration.names()) if name == "line delay"]
         of_calibration = system.gradient[2 * FRAME_SIZE :].copy()
         of_calibration[line] *= uv[1] / data.uv_px[0, 1]
         return np.concatenate([frames.reshape(-1), kept.gradient[0], of_calibration])
