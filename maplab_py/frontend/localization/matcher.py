@@ -1,7 +1,6 @@
 """Matches of a frame with a map: by the index, or near the places that a pose predicts."""
 
 import dataclasses
-from enum import Enum
 
 import numpy as np
 
@@ -22,19 +21,11 @@ _DISTANCE_FACTOR = 1.3
 """Largest distance of descriptors, in multiples of what the index allows."""
 
 
-class Source(Enum):
-    """Method by which an answer was found."""
-
-    INDEX = "index"
-    TRACKING = "map tracking"
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Answer:
     """N keypoints of a frame that observe landmarks of the map, each landmark and keypoint once."""
 
     time_ns: int
-    source: Source
     track_id: I64  # (N,) none is -1
     camera: I32  # (N,)
     landmark: I64  # (N,) rows of the map
@@ -85,7 +76,7 @@ class MapMatcher:
         result = self._localizer.localize(seen.query(q_M_I))
         if result.outcome is not Outcome.LOCALIZED:
             return None, result.outcome
-        return self._answer(seen, result, Source.INDEX), result.outcome
+        return self._answer(seen, result), result.outcome
 
     def track(self, seen: FrameKeypoints, T_G_I: F64, covariance: F64) -> Answer | None:
         """Match landmarks near their places as predicted by a pose with covariance (6, 6).
@@ -124,11 +115,11 @@ class MapMatcher:
         if len(np.unique(landmark)) >= self._matching.min_inlier_count:
             result = self._localizer.verify(seen.query(T_G_I[:4]), keypoint, landmark)
             if result.outcome is Outcome.LOCALIZED:
-                return self._answer(seen, result, Source.TRACKING)
+                return self._answer(seen, result)
         if float(np.median(radius_px)) > 2.0 * _LEAST_RADIUS_PX:
             return None
         chosen = _pairs(keypoint, landmark, error_px)
-        return self._of_pairs(seen, keypoint[chosen], landmark[chosen], Source.TRACKING)
+        return self._of_pairs(seen, keypoint[chosen], landmark[chosen])
 
     def _check(self, seen: FrameKeypoints) -> None:
         if not self._has_checked:
@@ -140,25 +131,23 @@ class MapMatcher:
         sigma_px = np.hypot(self._options.keypoint_sigma_px, predicted)
         return np.asarray(np.maximum(_SIGMAS * sigma_px, _LEAST_RADIUS_PX))
 
-    def _answer(self, seen: FrameKeypoints, result: Localization, source: Source) -> Answer | None:
+    def _answer(self, seen: FrameKeypoints, result: Localization) -> Answer | None:
         p_I = se3.transform(se3.inverse(result.T_G_I), self.p_G[result.landmark])
         k = result.keypoint
         error_px = angles_px(p_I, seen.origin_I[k], seen.ray_I[k], seen.rad_per_px[k])
         chosen = _pairs(k, result.landmark, error_px)
-        answer = self._of_pairs(seen, k[chosen], result.landmark[chosen], source)
+        answer = self._of_pairs(seen, k[chosen], result.landmark[chosen])
         if answer is None or len(answer) < self._options.min_num_constraints:
             return None
         return dataclasses.replace(answer, T_G_I=result.T_G_I, covariance=result.covariance)
 
-    def _of_pairs(
-        self, seen: FrameKeypoints, keypoint: I64, landmark: I64, source: Source
-    ) -> Answer | None:
+    def _of_pairs(self, seen: FrameKeypoints, keypoint: I64, landmark: I64) -> Answer | None:
         tracked = seen.track_id[keypoint] >= 0
         k = keypoint[tracked]
         if not len(k):
             return None
         return Answer(
-            seen.time_ns, source, seen.track_id[k], seen.camera[k], landmark[tracked],
+            seen.time_ns, seen.track_id[k], seen.camera[k], landmark[tracked],
             seen.origin_I[k], seen.ray_I[k], seen.rad_per_px[k], None, None,
         )  # fmt: skip
 

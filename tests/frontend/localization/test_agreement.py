@@ -9,7 +9,7 @@ import pytest
 from maplab_py.array_types import F64
 from maplab_py.frontend.localization.agreement import AgreementFilter, Verdict
 from maplab_py.frontend.localization.map_source import of_summary
-from maplab_py.frontend.localization.matcher import Answer, Source
+from maplab_py.frontend.localization.matcher import Answer
 from maplab_py.frontend.localization.online import OnlineLocalization
 from maplab_py.frontend.localization.options import OnlineLocalizationOptions
 from maplab_py.frontend.odometry import Odometry
@@ -30,7 +30,7 @@ def answer(time_ns: int, T_G_I: F64) -> Answer:
     ray = p_I / np.linalg.norm(p_I, axis=1, keepdims=True)
     rows = np.arange(len(P_G))
     return Answer(
-        time_ns, Source.INDEX, rows, np.zeros(len(P_G), dtype=np.int32), rows,
+        time_ns, rows, np.zeros(len(P_G), dtype=np.int32), rows,
         np.zeros((len(P_G), 3)), ray, np.full(len(P_G), 1e-3), T_G_I, 1e-4 * np.eye(6),
     )  # fmt: skip
 
