@@ -10,19 +10,12 @@ import numpy as np
 
 from maplab_py.array_types import I64, U64
 from maplab_py.storage import maplab_map_pb2 as pb
-from maplab_py.storage.load_checks import FileFacts, check_file
+from maplab_py.storage.load_checks import ENTITIES, FileFacts, check_file
 from maplab_py.storage.protobuf import scan, tables_from_messages, vertex_parts
 from maplab_py.storage.protobuf.ids import ids_of, ids_of_parts
 from maplab_py.storage.protobuf.map_files import FileKind, parse_message
 from maplab_py.vimap.table import starts_of_counts
 
-_ENTITIES = {
-    "vertex": "vertices",
-    "edge": "edges",
-    "mission": "missions",
-    "baseframe": "baseframes",
-}
-"""Entities with ids, by the name of their ids in the format."""
 _NO_IDS = np.zeros((0, 2), dtype=np.uint64)
 
 
@@ -56,7 +49,7 @@ class FileParts:
         parse_message(path, data, message, budget)
         self.facts.append(check_file(kind, path, message))
         place = len(self.facts) - 1
-        for name in _ENTITIES:
+        for name in ENTITIES:
             ids = ids_of(getattr(message, f"{name}_ids"), f"{path}: {name}_ids")
             self._ids.setdefault(f"{name}_ids", []).append(ids)
             self._file_of.setdefault(name, []).append(np.full(len(ids), place))
@@ -139,7 +132,7 @@ class FileParts:
             paths=paths,
             index_path=self._index_path or paths[0].parent,
             file_of={
-                _ENTITIES[name]: _stacked(parts, np.zeros(0, dtype=np.int64))
+                ENTITIES[name]: _stacked(parts, np.zeros(0, dtype=np.int64))
                 for name, parts in self._file_of.items()
             },
             **self._entities,

@@ -23,14 +23,14 @@ _FIELDS = {
     map_files.FileKind.EDGES: ("edges", "edge_ids"),
     map_files.FileKind.LANDMARK_INDEX: ("landmark_index", "legacy_landmark_ids"),
 }
-_PAIRS = (
-    ("vertices", "vertex_ids"),
-    ("edges", "edge_ids"),
-    ("missions", "mission_ids"),
-    ("baseframes", "baseframe_ids"),
-)
+ENTITIES = {
+    "vertex": "vertices",
+    "edge": "edges",
+    "mission": "missions",
+    "baseframe": "baseframes",
+}
+"""Entities with ids, by the name of their ids in the format."""
 _NO_NUMBER = "non-finite"
-_REPAIR = "load with --repair to drop what is no number"
 _NAMED = 3
 """Ids that a note names."""
 
@@ -59,10 +59,10 @@ def check_file(kind: map_files.FileKind, path: Path, message: pb.VIMap) -> FileF
             f"{path}: is listed as {kind.name.lower()} (file_type {kind:d}) but holds "
             f"{', '.join(foreign)}"
         )
-    for name, ids in _PAIRS:
-        entities, there = len(getattr(message, name)), len(getattr(message, ids))
+    for name, plural in ENTITIES.items():
+        entities, there = len(getattr(message, plural)), len(getattr(message, f"{name}_ids"))
         if entities != there:
-            raise MapError(f"{path}: holds {entities} {name} but {there} {ids}")
+            raise MapError(f"{path}: holds {entities} {plural} but {there} {name}_ids")
     has_roots = any(any(mission.root_vertex_id.words) for mission in message.missions)
     return FileFacts(kind, path, not held, has_roots, bool(message.vertices))
 
@@ -192,10 +192,7 @@ def consistency_notes(vi_map: VIMap) -> list[str]:
     """
     refused, tolerated = consistency.check_loaded(vi_map)
     if refused:
-        remedy = (
-            _REPAIR if _NO_NUMBER in refused[0].rule else "check_map_consistency lists such rules"
-        )
-        raise MapError(f"{_said(refused[0])}; {remedy}")
+        raise MapError(_refusal(refused[0], "load"))
     return [_said(violation) for violation in tolerated]
 
 
@@ -207,12 +204,16 @@ def check_loadable(vi_map: VIMap, folder: Path) -> None:
     """
     refused = consistency.check_saved(vi_map)
     if refused:
-        remedy = "save with --repair to drop what is no number"
-        if _NO_NUMBER not in refused[0].rule:
-            remedy = "check_map_consistency lists such rules"
-        raise MapError(
-            f"{folder}: not saved, as it could not be loaded: {_said(refused[0])}; {remedy}"
-        )
+        reason = _refusal(refused[0], "save")
+        raise MapError(f"{folder}: not saved, as it could not be loaded: {reason}")
+
+
+def _refusal(violation: consistency.Violation, verb: str) -> str:
+    """Return what a map violates, and what to do about it; the verb is that of the command."""
+    remedy = "check_map_consistency lists such rules"
+    if _NO_NUMBER in violation.rule:
+        remedy = f"{verb} with --repair to drop what is no number"
+    return f"{_said(violation)}; {remedy}"
 
 
 def _said(violation: consistency.Violation) -> str:

@@ -324,10 +324,8 @@ def _doubles(values: F64) -> bytes:
     return np.asarray(values, dtype="<f8").tobytes()
 
 
-RECORD_BYTES = 51
-"""Bytes of a point without its track: id, position, colour, error, length of the track."""
-ELEMENT_BYTES = 8
-"""Bytes of an element of a track: image and keypoint."""
+RECORD_BYTES, ELEMENT_BYTES = POINT.itemsize, ELEMENT.itemsize
+"""Bytes of a point without its track, and of an element of a track."""
 _LENGTH_AT = 43
 
 
