@@ -107,7 +107,6 @@ class _Segment:
 
     piece: Piece
     evaluation: selection.Evaluation  # of it alone, at the calibration of the database
-    evidence: changes.Evidence | None
 
     @property
     def covariance(self) -> F64:
@@ -171,7 +170,6 @@ class DeviceCalibration:
         except EstimationError:
             estimate = None  # without tracks there is no statement
         time_ns = segment.vertices.timestamp_ns
-        evidence = None
         source = segment
         if self._database is not None:
             source = with_device_of(segment, self._database.vi_map)
@@ -184,7 +182,7 @@ class DeviceCalibration:
             evidence = changes.evidence_of(estimate, int(time_ns[0]), int(time_ns[-1]))
             self._evidence.append(evidence)
         if len(evaluation.parameters) == len(self._parameters):
-            self._session.append(_Segment(piece, evaluation, evidence))
+            self._session.append(_Segment(piece, evaluation))
             self._unwritten += 1
         self._look_for_contradiction()
         if self._unwritten >= _SEGMENTS_AT_ONCE:
