@@ -42,7 +42,7 @@ def of_rows(S: F64, k: int, Y: F64, z: float, y: F64) -> None:
     q = row(y[FIRST], y[3], y[4], y[5], y[6], z)
     for c in range(6):
         S[k, c] = S[k, c] - Y[k, 1, c] * p + q
-    S[k + 1, 0] = z * q - p / y[FIRST + 2 * 1]
+    S[k + 1, 0] = z * q - p / y[FIRST + 2 * 1] + q[5] * p[k]
 
 
 lowered, lowered_rows = straight_line(all_operations), rows_of_six(of_rows)

@@ -30,9 +30,9 @@ def straight_line(function: Callable[..., None], width: int = 1, *, contracts: b
 
     Args:
         function: Assigns sums, products, functions of `math` and choices between two values, of real
-            arguments and entries, to names and to entries. Indices are sums and products of constants,
-            integers among the arguments and variables of loops over `range(CONSTANT)`. It has no other
-            statements.
+            arguments and entries, also of rows, to names and to entries. Indices are sums and products
+            of constants, integers among the arguments and variables of loops over `range(CONSTANT)`. It
+            has no other statements.
         width: Length of the last axis of arrays that are indexed by one index less than they have axes,
             and number of arguments of `row`. Sums and products of rows, and of rows and numbers, are rows.
         contracts: Whether a product and a sum may be one operation, which is rounded once.
@@ -162,6 +162,8 @@ class _Lowering:
                 return self._values[node.id]
             case ast.Constant():
                 return self._context.get_constant(_REAL, node.value)
+            case ast.Subscript(value=ast.Name(id=name)) if name in self._values:  # of a row
+                return builder.extract_element(self._values[name], self._index(node.slice))
             case ast.Subscript():
                 return builder.load(self._place(node), align=_BYTES)
             case ast.UnaryOp(op=ast.USub()):

@@ -14,7 +14,8 @@ matrix. The multifrontal method, which keeps update matrices on a stack until th
 them, makes as many operations with up to twice the memory.
 
 Where U is small it is computed as a whole and scattered. Where it is large every ancestor's part is
-computed on its own, into the panel itself if the rows lie side by side there.
+computed on its own, into the panel itself if the rows lie side by side there. Nodes of six numbers need
+less of BLAS: their panels are factorised by blocks, and a U that is not large is subtracted by blocks.
 
 Everything is sequential and ordered, so results are the same bits each time.
 """
@@ -23,6 +24,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64
 from maplab_py.compilation import compiled
+from maplab_py.estimation.linear.blocks_of_six import factorise_blocks, subtract_square
 from maplab_py.estimation.linear.dense_kernels import (
     MINUS_ONE,
     ONE,
@@ -41,6 +43,8 @@ from maplab_py.estimation.linear.symbolic import FrontPlan, most_below
 
 SCRATCH_SIZE = 2**18
 """Numbers of the small matrix: 2 MB, which stay in the processor's cache."""
+_MOST_BY_BLOCKS = 66
+"""Nodes below a supernode up to which blocks are subtracted faster than by BLAS."""
 
 
 @compiled()
@@ -58,16 +62,21 @@ def factorise(plan: FrontPlan, numbers: F64, scratch: F64, blas: Blas) -> int:
     d = plan.node_size
     room = most_below(plan) + 1
     local, runs = np.empty(room, np.int64), np.empty((room, 2), np.int64)
+    inverse = np.empty((1, 6))
     for s in range(len(plan.parent)):
         w = (plan.first_node[s + 1] - plan.first_node[s]) * d
         n = (plan.below_start[s + 1] - plan.below_start[s]) * d
         panel = numbers[plan.panel_start[s] : plan.panel_start[s + 1]]
-        bad_column = cholesky(blas, panel, w, w + n)
+        if d == 6:
+            bad_column = factorise_blocks(panel.reshape(-1, 6), w // 6, inverse)
+        else:
+            bad_column = cholesky(blas, panel, w, w + n)
         if bad_column != 0:
             return int(plan.first_node[s] + (bad_column - 1) // d)
         if n > 0:
-            below = panel[w:]  # L21 starts below L11 in every column
-            solve_triangle(blas, RIGHT, TRANSPOSED, panel, w + n, below, n, w, w + n)
+            if d != 6:
+                below = panel[w:]  # L21 starts below L11 in every column
+                solve_triangle(blas, RIGHT, TRANSPOSED, panel, w + n, below, n, w, w + n)
             _update_ancestors(plan, s, numbers, scratch, local, runs, blas)
     return -1
 
@@ -87,7 +96,8 @@ def _update_ancestors(
     rows = plan.below_start[s + 1] - start
     n = rows * d
     L21 = numbers[plan.panel_start[s] + w : plan.panel_start[s + 1]]
-    is_whole = n * n <= len(scratch)
+    by_blocks = d == 6 and rows <= _MOST_BY_BLOCKS
+    is_whole = not by_blocks and n * n <= len(scratch)
     if is_whole:
         square(blas, L21, w + n, n, w, scratch)
     for i in range(rows):
@@ -102,13 +112,14 @@ def _update_ancestors(
             panel = numbers[plan.panel_start[front] : plan.panel_start[front + 1]]
             target = Matrix(panel, len(panel) // (width * d))
             part, cols = local[begin:rows], end - begin
-            if is_whole:
+            L = Matrix(L21[begin * d :], w + n)
+            if by_blocks:
+                subtract_square(L, w // d, part, cols, target)
+            elif is_whole:
                 update = Matrix(scratch[begin * d * (n + 1) :], n)
                 _scatter(update, part, part[:cols], d, True, runs, target)
             else:
-                _update_panel(
-                    Matrix(L21[begin * d :], w + n), w, part, cols, d, runs, target, scratch, blas
-                )
+                _update_panel(L, w, part, cols, d, runs, target, scratch, blas)
         below = plan.below_start[front] - width
         for i in range(end, rows):
             local[i] = plan.below_in_parent[below + local[i]]

@@ -49,8 +49,9 @@ class FrontPlan(NamedTuple):
     panel_start: I64  # (S + 1,) offsets into the factor's numbers
 
 
-_WIDEST = 256
-"""Columns of a panel at most: half of its square on the diagonal is stored in vain."""
+_WIDEST, _WIDEST_OF_SIX = 256, 96
+"""Columns of a panel at most: half of its square on the diagonal is stored in vain. Panels of nodes of
+six numbers, which are not factorised by BLAS, should stay in the processor's cache."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -81,7 +82,7 @@ def _fronts(
     first_node: I64, structure_start: I64, structure: I64, node_size: int
 ) -> tuple[I64, I64, I64]:
     """Cut wide supernodes; return first nodes (S + 1,), offsets (S + 1,) and nodes (R,) below."""
-    most = max(1, _WIDEST // node_size)
+    most = max(1, (_WIDEST_OF_SIX if node_size == 6 else _WIDEST) // node_size)
     count = -(-np.diff(first_node) // most)
     whole = np.repeat(np.arange(len(count)), count)  # supernode of every piece
     step = np.arange(len(whole)) - np.repeat(np.cumsum(count) - count, count)

@@ -182,7 +182,7 @@ class PoseGraphProblem:
         return PoseLinearization(system, 0.5 * float(total))
 
     def try_step(self, states: F64, linear: PoseLinearization, damping: float) -> Step[F64]:
-        """Return the poses after the damped step.
+        """Return the poses after the damped step, or after a part of it if it leads uphill.
 
         Raises:
             NotPositiveDefinite: The damped equations are singular.
@@ -190,10 +190,22 @@ class PoseGraphProblem:
         gradient, added = linear.system.gradient, damping * _positive(linear.system.diagonal)
         self._factorise(added)
         twist = self._solver.solve(-gradient.reshape(-1)).reshape(-1, 6)
-        promised = 0.5 * float(np.vdot(twist, added * twist - gradient))
+        downhill = -float(np.vdot(gradient, twist))
+        curvature, share = downhill - float(np.vdot(twist, added * twist)), 1.0
+        moved, cost = self._moved(states, twist)
+        if (
+            linear.cost < cost < np.inf
+        ):  # then to the least of a parabola, as factorisations cost more
+            share = 0.5 * downhill / (cost - linear.cost + downhill)
+            twist *= share
+            moved, cost = self._moved(states, twist)
+        promised = share * (downhill - 0.5 * share * curvature)
+        return Step(moved, {"pose graph": cost}, promised, float(np.sqrt(np.vdot(twist, twist))))
+
+    def _moved(self, states: F64, twist: F64) -> tuple[F64, float]:
+        """Return the poses after a step, and half the sum that is minimised there."""
         moved: F64 = self._kernels.moved(states, self._free, twist)
-        costs = {"pose graph": 0.5 * self.cost(moved)}
-        return Step(moved, costs, promised, float(np.sqrt(np.vdot(twist, twist))))
+        return moved, 0.5 * self.cost(moved)
 
     def _factorise(self, added: F64) -> None:
         """Factorise the equations with some numbers (N, 6) added to their diagonal."""

@@ -93,10 +93,11 @@ def test_solution_and_inverse_agree_with_dense_algebra(node_size, name):
         np.testing.assert_allclose(value, inverse[row : row + d, col : col + d], atol=1e-12)
 
 
+@pytest.mark.parametrize("d", [3, 6])
 @pytest.mark.parametrize("name", ["one node", "chain", "star", "cameras"])
-def test_indefinite_matrix_is_refused_and_the_solver_lives_on(name):
-    rows, cols, n, values, dense = system(name, 3, seed=5)
-    solver = BlockCholesky(rows, cols, n, 3)
+def test_indefinite_matrix_is_refused_and_the_solver_lives_on(name, d):
+    rows, cols, n, values, dense = system(name, d, seed=5)
+    solver = BlockCholesky(rows, cols, n, d)
     bad = values.copy()
     victim = n // 2
     bad[(rows == victim) & (cols == victim), 1, 1] = -1e6
@@ -107,17 +108,18 @@ def test_indefinite_matrix_is_refused_and_the_solver_lives_on(name):
     if name == "one node":
         assert caught.value.node == victim
     with pytest.raises(ValueError, match="factor"):
-        solver.solve(np.ones(n * 3))
+        solver.solve(np.ones(n * d))
     solver.factor(values)
-    np.testing.assert_allclose(dense @ solver.solve(np.ones(n * 3)), 1.0, atol=1e-9)
+    np.testing.assert_allclose(dense @ solver.solve(np.ones(n * d)), 1.0, atol=1e-9)
 
 
-def test_a_node_without_information_and_one_that_is_not_a_number_are_named():
-    rows, cols, n, values, _ = system("singletons", 2, seed=0)
+@pytest.mark.parametrize("node_size", [2, 6])
+def test_a_node_without_information_and_one_that_is_not_a_number_are_named(node_size):
+    rows, cols, n, values, _ = system("singletons", node_size, seed=0)
     for bad_value in (0.0, np.nan):
         bad = values.copy()
         bad[rows == 4] = bad_value
-        solver = BlockCholesky(rows, cols, n, 2)
+        solver = BlockCholesky(rows, cols, n, node_size)
         with pytest.raises(protocol.NotPositiveDefinite) as caught:
             solver.factor(bad)
         assert caught.value.node == 4
@@ -157,35 +159,38 @@ def arrow(branches: int, length: int, trunk: int) -> tuple[np.ndarray, np.ndarra
     return np.concatenate(rows), np.concatenate(cols), n
 
 
-def random_system(rows: np.ndarray, cols: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return values (B, 3, 3) of a definite matrix, and the matrix."""
+def random_system(
+    rows: np.ndarray, cols: np.ndarray, n: int, d: int = D
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return values (B, d, d) of a definite matrix, and the matrix."""
     rng = np.random.default_rng(0)
-    values = rng.normal(size=(len(rows), D, D))
+    values = rng.normal(size=(len(rows), d, d))
     strict = rows != cols
     values[~strict] = values[~strict] @ np.swapaxes(values[~strict], 1, 2)
-    values[~strict] += 8.0 * np.sqrt(n) * np.eye(D)
-    dense = np.zeros((n, D, n, D))
+    values[~strict] += 8.0 * np.sqrt(n) * np.eye(d)
+    dense = np.zeros((n, d, n, d))
     np.add.at(dense.transpose(0, 2, 1, 3), (rows, cols), values)
     upper = np.swapaxes(values[strict], 1, 2)
     np.add.at(dense.transpose(0, 2, 1, 3), (cols[strict], rows[strict]), upper)
-    return values, dense.reshape(n * D, n * D)
+    return values, dense.reshape(n * d, n * d)
 
 
-def test_wide_fronts_are_cut_and_solved() -> None:
-    """Every way of an update: whole and scattered, in tiles, and straight into the panel."""
-    rows, cols, n = arrow(branches=4, length=3, trunk=400)
-    pattern = BlockPattern.checked(rows, cols, n, D)
+@pytest.mark.parametrize(("d", "trunk", "widest"), [(3, 400, 256), (6, 200, 96)])
+def test_wide_fronts_are_cut_and_solved(d: int, trunk: int, widest: int) -> None:
+    """Every way of an update: by blocks, whole and scattered, in tiles, and straight into the panel."""
+    rows, cols, n = arrow(branches=4, length=3, trunk=trunk)
+    pattern = BlockPattern.checked(rows, cols, n, d)
     plan = analyse(pattern, ordering.AUTOMATIC).plan
-    width = np.diff(plan.first_node) * D
-    assert width.max() <= 256
-    assert (np.diff(plan.below_start).max() * D) ** 2 > supernodal.SCRATCH_SIZE
-    values, dense = random_system(rows, cols, n)
-    solver = BlockCholesky(rows, cols, n, D)
+    width = np.diff(plan.first_node) * d
+    assert width.max() <= widest
+    assert (np.diff(plan.below_start).max() * d) ** 2 > supernodal.SCRATCH_SIZE
+    values, dense = random_system(rows, cols, n, d)
+    solver = BlockCholesky(rows, cols, n, d)
     solver.factor(values)
-    b = np.random.default_rng(1).normal(size=(n * D, 2))
+    b = np.random.default_rng(1).normal(size=(n * d, 2))
     wanted = np.linalg.solve(dense, b)
     np.testing.assert_allclose(solver.solve(b), wanted, atol=1e-11 * np.abs(wanted).max())
-    inverse = np.linalg.inv(dense).reshape(n, D, n, D)
+    inverse = np.linalg.inv(dense).reshape(n, d, n, d)
     found = solver.inverse_blocks()
     np.testing.assert_allclose(found, inverse[rows, :, cols], atol=1e-11 * np.abs(found).max())
 

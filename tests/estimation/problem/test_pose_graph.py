@@ -37,11 +37,11 @@ def _system(problem, T):
     return system.gradient.reshape(-1).copy(), H.transpose(0, 2, 1, 3).reshape(6 * size, 6 * size)
 
 
-def _problem(rng, kind, loss=Loss.NONE):
+def _problem(rng, kind, loss=Loss.NONE, error=0.3):
     """Return poses and a problem of four, the first fixed, with edges either way round."""
     T, free = _poses(rng, 4), np.array([False, True, True, True])
     a, b = np.array([1, 0, 3, 2, 3]), np.array([0, 2, 1, 3, 2])
-    edges = _edges(rng, T, a, b, kind=kind, error=0.3)
+    edges = _edges(rng, T, a, b, kind=kind, error=error)
     tilt = TiltPriors.of_vertices(np.array([0, 2]), se3.retract(T, np.full(6, 0.05)), 5.0)
     loops = edges.take(np.arange(3, 5))
     return T, PoseGraphProblem(free, edges.take(np.arange(3)), loops, tilt, loss)
@@ -126,6 +126,19 @@ def test_promised_decrease_is_that_of_the_model():
     assert step.promised == pytest.approx(-gradient @ x - 0.5 * x @ H @ x)
     assert step.norm == pytest.approx(np.linalg.norm(x))
     assert step.cost == pytest.approx(0.5 * problem.cost(step.states))
+
+
+def test_a_step_that_leads_uphill_is_shortened():
+    T, problem = _problem(np.random.default_rng(2), PoseError.LOGARITHM, error=4.0)
+    gradient, H = _system(problem, T)
+    linear = problem.linearize(T, 0.0)
+    step = problem.try_step(T, linear, 1e-9)
+    x = np.linalg.solve(H + 1e-9 * np.diag(np.diag(H)), -gradient)
+    share = step.norm / np.linalg.norm(x)
+    assert 0.0 < share < 0.5
+    assert step.cost == pytest.approx(_half_cost(problem, T, share * x))
+    assert step.cost < linear.cost < _half_cost(problem, T, x)
+    assert step.promised == pytest.approx(share * (-gradient @ x - 0.5 * share * x @ H @ x))
 
 
 def test_inactive_closures_do_not_count():
