@@ -14,6 +14,8 @@ from pathlib import Path
 from maplab_py.errors import UserError
 
 _GB = 1e9
+_NEGLIGIBLE = 1e7
+"""Bytes that are not refused without a limit: to ask what is available takes half a millisecond."""
 _SHARE = 0.9
 """Fraction of the available memory that one command may take."""
 _GLOBAL_FLAG = "--max_memory_gb"
@@ -70,6 +72,8 @@ def require_memory(needed_bytes: float, purpose: str) -> None:
         NotEnoughMemory: The work does not fit.
     """
     limit = _limit_bytes.get()
+    if limit is None and needed_bytes < _NEGLIGIBLE:
+        return
     allowed = _SHARE * available_bytes() if limit is None else limit
     used = 0.0 if limit is None else max(0.0, resident_bytes() - _bytes_before.get())
     if needed_bytes + used <= allowed:

@@ -174,7 +174,7 @@ def _pose_graph_source(kind: PoseError) -> str:
     }[kind]
     functions: list[tuple[str, Any, str, list[str | None]]] = [
         ("error", pose_graph.linearised(error), "A, B, measured", ["e", None, None]),
-        ("linearised", pose_graph.linearised(error), "A, B, measured", ["e", "J_A", "J_B"]),
+        ("linearised", pose_graph.linearised(error), "A, B, measured", ["e", "J_B", "C"]),
         ("second", pose_graph.second_derivatives(error), "A, B, measured, g", ["AA", "BB", "BA"]),
         ("tilt", pose_graph.tilt(), "T, measured", ["e", "J"]),
         ("retraction", pose_graph.retraction(), "T, x", ["moved"]),

@@ -102,10 +102,10 @@ class Ordering:
         if self.kind is OrderingKind.NESTED_DISSECTION:
             return self._nested_dissection(graph)
         first = minimum_degree_of_groups(graph)
-        if self.kind is OrderingKind.MINIMUM_DEGREE or not self._can_dissect:
+        if self.kind is OrderingKind.MINIMUM_DEGREE:
             return first
         work = graph.work(first, node_size)
-        if work < _WORTH_ANOTHER:
+        if work < _WORTH_ANOTHER or not self._can_dissect:
             return first
         second = self._nested_dissection(graph)
         return second if graph.work(second, node_size) < work else first

@@ -49,11 +49,14 @@ def _second_coefficient(angle: SX) -> SX:
 
 
 def linearised(error: Error) -> Any:
-    """Return f(T_A, T_B, T_measured) -> e (6), its derivatives (6 x 6) by twists of A and of B."""
+    """Return f(T_A, T_B, T_measured) -> e (6), and transposed J_B and C (6 x 6) of its derivatives.
+
+    Those by twists of B are J_B, those by twists of A are J_B C.
+    """
     T_A, T_B, measured, q, p, x = _symbols()
     at_twist = error(*_moved(q, p, x), measured)
     J_B, value = (_at_zero(result, x) for result in (ca.jacobian(at_twist, x), at_twist))
-    results = [value, -J_B @ _adjoint_of_inverse(q, p), J_B]
+    results = [value, J_B.T, -_adjoint_of_inverse(q, p).T]
     arguments = [T_A, T_B, measured]
     return ca.Function("linearised", arguments, ca.cse([ca.densify(result) for result in results]))
 
