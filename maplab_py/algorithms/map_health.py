@@ -1,7 +1,7 @@
-"""Health of a map: lights with figures, causes before effects, and the command that mends each.
+"""Health of a map: lights with figures, causes before effects, and the remedy of each fault.
 
-Thresholds lie between the figures of real maps whose errors against ground truth are small and those of
-maps made with wrong calibrations; they judge, and change nothing.
+Thresholds lie between the figures of real maps with small errors against ground truth and those of
+maps made with wrong calibrations. Maps are not changed.
 """
 
 import dataclasses

@@ -1,7 +1,8 @@
-"""Scale of a map against its accelerometers: a map that has collapsed contradicts them.
+"""Scale of a map compared with its accelerometers, which a collapsed map contradicts.
 
-Three consecutive vertices give an acceleration, by their positions and by their IMU samples. That of the
-positions is regressed on the other: positions are noisy, which leaves the slope as it is, samples hardly.
+Three consecutive vertices give an acceleration by their positions and another by their IMU samples. The
+former is regressed on the latter: noise of the positions does not bias the slope, and samples have little
+noise.
 """
 
 import dataclasses

@@ -1,8 +1,8 @@
 """Parameters beside vertices and landmarks: calibrations, switches, whatever a plugin adds.
 
-A block holds N parameters of one kind. Every parameter is cut into nodes of three numbers, like
-everything else in the normal equations; a vector of five numbers has two nodes, and the sixth
-direction is padding that never moves.
+A block holds N parameters of one kind. Every parameter is divided into nodes of three numbers, like
+all other states in the normal equations; a vector of five numbers has two nodes, and the sixth
+direction is padding that never changes.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Robust losses: which one, and how far a residual may go before it counts less."""
+"""Robust losses of whitened residuals, and their scales."""
 
 from enum import IntEnum
 

@@ -1,4 +1,4 @@
-"""The kernels of the optimiser, compiled before they are needed."""
+"""Warm-up of the optimiser's kernels: each is compiled before its first use."""
 
 from collections.abc import Callable
 from functools import partial

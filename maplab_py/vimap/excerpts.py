@@ -1,4 +1,4 @@
-"""Parts of a map that are edited alone, and their results written back into the map."""
+"""Parts of a map that are edited separately and written back into the map."""
 
 import dataclasses
 import hashlib

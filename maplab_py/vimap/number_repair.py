@@ -1,4 +1,4 @@
-"""Removal of what is no number, so that the rest of a map can be loaded and saved."""
+"""Removal of rows with non-finite numbers, so that the rest of a map can be loaded and saved."""
 
 from typing import Any
 

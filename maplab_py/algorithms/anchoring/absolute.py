@@ -1,8 +1,8 @@
 """Anchor missions by their absolute poses: markers, satellite positions, poses of another program.
 
-Absolute poses are measured in G, so a mission that has some needs no other mission. As in maplab they
-come before anchoring by places. The alignment is the smallest sum of distances, which up to half of the
-measurements may miss; it needs no random samples.
+Absolute poses are measured in G, so a mission with absolute poses needs no other mission. As in maplab
+they precede anchoring by places. The alignment minimises the sum of distances, which tolerates up to half
+of the measurements as outliers; it needs no random samples.
 """
 
 from typing import NamedTuple

@@ -1,18 +1,18 @@
 """Decide between the alignments of two missions, or leave the relation open.
 
-Two missions in places that look alike have several alignments, and the largest group of closures is
-no evidence by itself. The best alignment wins when, in both missions, it explains many stretches
-that a rival does not explain, and a rival explains hardly any that it does not. Sessions that visit
-two rooms that look alike have such an alignment: those that exchange the rooms explain half. A
-session that visits one of them has not: whichever room it is matched with, the other mission's
-stretches in the other room stay unexplained.
+Two missions in places that look alike have several alignments, and the size of the largest group of
+closures is no evidence. The best alignment is accepted when, in both missions, it explains many
+stretches that a rival does not explain, and a rival explains hardly any that it does not. Sessions
+that visit two similar rooms have such an alignment: a rival that exchanges the rooms explains half of
+the stretches. A session that visits only one of them has not: whichever room it is matched with, the
+other mission's stretches in the other room stay unexplained.
 
-A rival needs not be beaten where it contradicts what must be in view: it brings trajectories
-together, and there the landmarks of one mission are never matched by the other.
+A rival is refuted where it contradicts visibility: it brings trajectories together, but landmarks of
+one mission are never matched by the other.
 
-A third mission that has seen two places which one of the two missions cannot distinguish reveals
-rivals that the closures between the two do not show, because one of them never was in the second
-place. Such a pair stays open.
+A third mission that has visited two places which one of the two missions cannot distinguish reveals
+rivals that the closures between the two do not show, because one of them never visited the second
+place. Such a pair stays undecided.
 """
 
 import dataclasses

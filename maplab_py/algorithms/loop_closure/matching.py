@@ -1,9 +1,9 @@
 """Match keypoints with the nearest landmarks by their descriptors.
 
-One index over all landmarks finds the few nearest ones. Where many missions have seen a place, its
-landmarks exist many times and each mission gets so few of a query's neighbours that no place can be
-verified. Then the neighbours only choose the missions: each query is compared with those that most of
-them belong to, one index for each, so that the work grows with the number of queries alone.
+A single index over all landmarks finds the few nearest ones. Where many missions have observed a place,
+its landmarks exist many times, and each mission gets too few of a query's neighbours to verify a place.
+Then the neighbours only select missions: each query is compared with the missions to which most of them
+belong, with an index for each, so that the work is proportional to the number of queries.
 """
 
 import hashlib

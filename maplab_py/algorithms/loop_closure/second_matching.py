@@ -1,7 +1,7 @@
 """Second matching of candidates whose nearest neighbours left too few inliers, by a network.
 
-Nearest neighbours look at single descriptors. LighterGlue looks at all keypoints of two images at once, and
-finds those that other light has changed too much for that, at about 0.1 s for two images.
+Nearest neighbours compare single descriptors. LighterGlue matches all keypoints of two images jointly, also
+those whose descriptors a change of light has altered too much, in about 0.1 s per pair.
 """
 
 import numpy as np

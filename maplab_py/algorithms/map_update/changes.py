@@ -1,8 +1,9 @@
 """Regions of a map that vanished, appeared or moved between earlier and later sessions.
 
-A landmark of the earlier sessions that the later ones should have seen and did not may have vanished, or was
-not detected; likewise one of the later sessions that the earlier ones did not see. A region has changed where
-many more landmarks are missing than elsewhere: the chance of a miss is counted in the rest of the map.
+A landmark of earlier sessions that later ones should have observed and did not has vanished, or was not
+detected; likewise a landmark of later sessions that earlier ones did not observe. A region has changed
+where many more landmarks are missing than elsewhere: the probability of a miss is estimated from the rest
+of the map.
 """
 
 import dataclasses

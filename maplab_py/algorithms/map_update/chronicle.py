@@ -1,8 +1,8 @@
-"""Chronicle of a map: what each update did, and what leads back to the map before it.
+"""Chronicle of a map: a report of each update, and the differences that restore earlier maps.
 
 A record is a text among the resources of the newest mission: reports of updates, and the columns of the map
-before them as differences from those after. Rows of a column that both maps hold are numbers of rows. A map
-keeps few differences: beyond them two neighbours become one, which leads back over both.
+before them as differences from those after. Rows that both maps have are stored as row numbers. A map keeps
+a limited number of differences: beyond it two neighbours are merged, which restores the map before both.
 """
 
 import base64

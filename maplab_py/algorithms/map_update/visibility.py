@@ -1,4 +1,4 @@
-"""Prediction of which landmarks a session should see, and which it sees.
+"""Visibility of landmarks in a session: predicted and observed.
 
 A landmark is predicted in an image if it projects into it, from a direction and distance near those of its
 observers, and the landmarks that the image observes around it are not much nearer. It is matched if the image

@@ -1,4 +1,4 @@
-"""A calibration with what a recording has shown: mounting, time offset, line delay, scale, noise."""
+"""Correction of a calibration by findings on a recording: mounting, time offset, line delay, scale, noise."""
 
 import dataclasses
 from collections.abc import Sequence

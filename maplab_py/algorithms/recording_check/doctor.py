@@ -1,4 +1,4 @@
-"""The doctor: all checks of a recording, causes before effects, and the line that a run says of them."""
+"""The doctor: all checks of a recording, causes before effects, and their summary in one line for a run."""
 
 import dataclasses
 from collections.abc import Iterator, Sequence

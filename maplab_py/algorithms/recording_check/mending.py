@@ -1,4 +1,4 @@
-"""A recording that is read with what its check has shown: units, axes, calibration."""
+"""A recording read with corrected units, axes and calibration."""
 
 import dataclasses
 from collections.abc import Iterator

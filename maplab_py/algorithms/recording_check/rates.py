@@ -1,4 +1,4 @@
-"""The turn of a camera against the gyroscope, taken apart into unit, axes, mounting and time."""
+"""Comparison of camera rotation and gyroscope: errors of unit, axes, mounting and time."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""The geometry of two cameras against the points that both see."""
+"""The geometry of two cameras, compared with points that both observe."""
 
 import dataclasses
 from typing import Any

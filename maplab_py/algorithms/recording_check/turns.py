@@ -1,4 +1,4 @@
-"""Turns of a camera from its images alone, and against the gyroscope.
+"""Rotations of a camera from its images alone, and compared with the gyroscope.
 
 Notation: 1 and 2 are the two images of a pair, R_1_2 the attitude of the camera at the second in the frame
 of the first. Residuals are distances of rays to epipolar planes in units of pixels; directions of translation

@@ -1,20 +1,20 @@
-"""Relaxation: loop closures pull the trajectories together, everything else moves along.
+"""Relaxation: pose-graph optimisation with loop closures; landmarks and velocities follow their vertices.
 
-The variables are vertex poses and base frames. Between neighbours of a mission the map's present
-relative pose is a measurement with the covariance of odometry drift; loop closures are measurements
-between far vertices, some of them false. A base frame turns about the vertical and moves; what a
-mission's base frame does, its vertices could do as well, so the first vertex of each mission keeps
-position and heading in M. The optimum is the same for poses in G: it is found for those, and then
-divided between base frames and vertices. Landmarks stay where they are in their vertex' body frame,
-so they move rigidly with it; velocities turn with it; biases stay.
+The variables are vertex poses and base frames. Between neighbours of a mission the current relative
+pose is a measurement with the covariance of odometry drift; loop closures are measurements between
+distant vertices, some of them false. A base frame has yaw and position. Moving it is equivalent to
+moving all vertices of its mission, so the first vertex of each mission keeps position and heading
+in M. Poses in G have the same optimum: it is computed for those, and then divided between base frames
+and vertices. Landmarks are fixed in the body frame of their vertex, so they move rigidly with it;
+velocities rotate with it; biases do not change.
 
-False closures are found by graduated non-convexity and a test of each (see `robust`,
-`closure_consistency`), or held off by robust weighting (switchable constraints: Suenderhauf and
+False closures are detected by graduated non-convexity and a test of each (see `robust`,
+`closure_consistency`), or down-weighted robustly (switchable constraints: Suenderhauf and
 Protzel, IROS 2012; dynamic covariance scaling: Agarwal et al., ICRA 2013).
 
 Use: `find_loop_closures` of `algorithms.loop_closure` gives the edges for `loop_closures`; those are
 constraints of this call only and are not added to the map. The map's own loop-closure edges always
-count and stay in the map, their switch variables telling what became of them.
+count and stay in the map, with the verdict in their switch variables.
 """
 
 import dataclasses

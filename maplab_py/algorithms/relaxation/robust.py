@@ -1,7 +1,7 @@
-"""The robust optimisation of a pose graph: ever stricter losses, then a test of every closure.
+"""Robust optimisation of a pose graph: ever stricter losses, then a test of every closure.
 
-Far from the answer a true closure looks as false as a false one. So a loss begins where most closures
-count and becomes stricter step by step (graduated non-convexity: Yang et al., RA-L 2020).
+Far from the optimum true and false closures have equally large residuals. Hence the loss starts where most
+closures have weight and becomes stricter step by step (graduated non-convexity: Yang et al., RA-L 2020).
 """
 
 import dataclasses

@@ -1,7 +1,7 @@
-"""Detection of calibrations that new segments contradict, and sums of what segments know.
+"""Detection of calibrations that new segments contradict, and sums of the segments' information.
 
-Evidence of a segment is its score (gradient of the log likelihood at the present calibration) and its
-information; both add up over segments. Every family of parameters is tested over all spans of time that
+Evidence of a segment is its score (gradient of the log likelihood at the current calibration) and its
+information; both add up over segments. Every family of parameters is tested over all time spans that
 end with the newest segment, as in a generalised likelihood ratio test for a change at an unknown time.
 """
 

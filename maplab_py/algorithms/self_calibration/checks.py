@@ -1,7 +1,7 @@
 """Calibration with checks that formal deviations cannot replace.
 
-Formal deviations follow from the noise of the measurements. On recorded maps they are several times
-too small for the camera's position, because they do not contain errors of the models (decision 18).
+Formal deviations follow from the measurement noise. On recorded maps they are several times
+too small for the camera's position, because they do not include model errors (decision 18).
 Hence the camera's position is limited, and results on parts of the data are compared.
 """
 

@@ -1,9 +1,8 @@
 """Calibration that the residuals contradict, which `--ba_calibration=auto` frees.
 
-At an optimum with a fixed calibration one step of Gauss and Newton, with the calibration free, says by how
-much the cost would fall with each group of its numbers (a score test: C. R. Rao, 1948). Groups are chosen
-one after the other, by what they gain beside those chosen already, since a wrong delay looks like a wrong
-rotation, too.
+At an optimum with a fixed calibration, one Gauss-Newton step with free calibration predicts the decrease of
+the cost for each group of parameters (a score test: C. R. Rao, 1948). Groups are chosen successively, by
+their gain in addition to the groups already chosen, since a wrong delay also resembles a wrong rotation.
 """
 
 import dataclasses

@@ -1,10 +1,9 @@
-"""Optimisation of what new vertices touch; all other vertices are held fixed.
+"""Local optimisation of new vertices and their neighbours; all other vertices are fixed.
 
-Free are the new vertices and those that observe most of the same landmarks; fixed are further
-vertices that observe a landmark of a free one. Landmarks of the free vertices are free. Both numbers
-of vertices are bounded, and so is the time, however large the map is. The result is the optimum of
-all states given those of the fixed vertices: what an error of theirs means is left to the next joint
-optimisation.
+Free are the new vertices and those that share most landmarks with them; fixed are other
+vertices that observe a landmark of a free vertex. Landmarks of free vertices are free. The numbers of
+free and fixed vertices, and hence the time, are bounded for maps of any size. The result is the optimum
+of all states given the fixed vertices, whose errors are left to the next joint optimisation.
 """
 
 import dataclasses

@@ -1,4 +1,4 @@
-"""The inertial samples of many edges, checked, with what is known of the IMUs."""
+"""Validated inertial samples of many edges, with the calibrations of the IMUs."""
 
 from __future__ import annotations
 

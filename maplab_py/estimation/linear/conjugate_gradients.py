@@ -1,4 +1,4 @@
-"""Preconditioned conjugate gradients, stopped early (truncated Newton steps).
+"""Preconditioned conjugate gradients with early termination (truncated Newton steps).
 
 Hestenes and Stiefel, Methods of Conjugate Gradients for Solving Linear Systems, 1952; the residual is
 measured in the norm of the preconditioner, r' M^-1 r, which weighs metres, radians and biases alike

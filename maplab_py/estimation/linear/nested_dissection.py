@@ -1,9 +1,9 @@
 """Nested dissection: cut the graph in halves, order each half, and eliminate the cut last.
 
-Trajectories that overlap make a long thin graph. A minimum-degree order looks at one node at a time
-and does not find the short cuts across it; here they are looked for (George 1973). METIS finds them
+Overlapping trajectories make a long thin graph. Minimum degree considers a single node at a time and
+misses its small separators, which nested dissection searches for (George 1973). METIS finds them
 in the graph alone (Karypis and Kumar 1998, multilevel nested dissection). Where METIS is not
-installed the places of the nodes in space tell where to cut.
+installed, the graph is cut by the positions of the nodes.
 """
 
 import importlib.util

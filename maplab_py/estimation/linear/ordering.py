@@ -1,7 +1,7 @@
-"""The order in which nodes are eliminated: of several candidates the one that takes least work.
+"""Elimination order of the nodes: the candidate whose factorisation needs the fewest operations.
 
-Minimum degree suits single sessions; trajectories that overlap want nested dissection. Which of them
-is better is not guessed: the operations that a factorisation would take are counted for both.
+Minimum degree suits single sessions, nested dissection overlapping trajectories. No rule chooses
+between them: the operations of the factorisation are counted for both.
 """
 
 import dataclasses

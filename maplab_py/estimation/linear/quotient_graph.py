@@ -1,7 +1,7 @@
-"""The graph of a block pattern in which nodes with equal neighbourhoods are one.
+"""The quotient graph of a block pattern: nodes with equal neighbourhoods are merged.
 
-Position and orientation of one camera, say, have blocks with the same other nodes. Ordered as one
-they make the graph small, and they end up side by side, hence in one supernode.
+Position and orientation of a camera, for instance, have blocks with the same other nodes. Merged
+nodes make the graph small, and are adjacent in the order, hence in the same supernode.
 """
 
 from __future__ import annotations

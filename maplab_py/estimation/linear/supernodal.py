@@ -2,7 +2,7 @@
 
 The lower triangle of A is summed into the panels of L (`block_storage`), zeros where L fills in.
 Supernodes are visited from the leaves of the elimination tree to its roots ("right-looking": Ng and
-Peyton, Block Sparse Cholesky Algorithms, 1993). With F = [F11; F21] the panel of one of them, which has
+Peyton, Block Sparse Cholesky Algorithms, 1993). With F = [F11; F21] the panel of a supernode, which has
 received all updates by then,
 
     L11 L11^T = F11            dpotrf

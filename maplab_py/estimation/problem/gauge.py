@@ -1,8 +1,8 @@
-"""Gauge: what a problem cannot observe is fixed, and nothing else.
+"""Gauge: exactly the unobservable directions of a problem are fixed.
 
-With inertial terms gravity shows roll and pitch and the accelerometer shows scale: position and
-heading of one vertex per cluster are free to choose (4 dimensions). With images alone orientation
-and scale are too (7). Clusters are sets of vertices that terms join.
+With inertial terms roll, pitch and scale are observable; position and heading of one vertex per
+cluster are not (4 dimensions). With images alone orientation and scale are unobservable, too (7).
+Clusters are sets of vertices that are connected by terms.
 """
 
 import numpy as np

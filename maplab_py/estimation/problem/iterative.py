@@ -1,8 +1,8 @@
 """A problem whose steps come from conjugate gradients; the reduced system is never formed.
 
-Kept between calls: 12 single-precision numbers an observation, 15 a landmark, the poses' diagonal
-blocks, and the factors' Jacobians. A step is a truncated Newton step; the trust region judges it by the
-decrease that the quadratic model promises for it, as it does any other.
+Stored between calls: 12 single-precision numbers per observation, 15 per landmark, the poses' diagonal
+blocks, and the factors' Jacobians. A step is a truncated Newton step; the trust region compares it with
+the decrease that the quadratic model predicts, like any other step.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Uncertainty of an optimum: blocks of the inverse of the normal equations.
 
-The gauge is that of the problem: what is held has no variance, and covariances are relative to it.
-With robust losses the weights at the optimum count, so down-weighted measurements tell little.
+The gauge is that of the problem: fixed states have no variance, and covariances are relative to them.
+With robust losses the weights at the optimum are used, so down-weighted measurements contribute little.
 """
 
 import dataclasses

@@ -1,7 +1,7 @@
-"""Pose graphs as least squares: one node of six numbers a pose, and nothing else.
+"""Pose graphs as least squares: one node of six numbers per pose.
 
-`Problem` has five nodes of three numbers a vertex. On graphs of some hundred poses that, and the
-Jacobians it keeps, cost several times what these blocks of 6 x 6 do (see decision 11). The
+`Problem` has five nodes of three numbers per vertex. On graphs of some hundred poses these nodes and
+the stored Jacobians cost several times as much as blocks of 6 x 6 (see decision 11). The
 solver, the trust region and the losses are the same.
 """
 

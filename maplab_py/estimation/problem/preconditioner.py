@@ -3,12 +3,12 @@
     M = all terms that are not visual + the 6 x 6 diagonal blocks of the visual Schur complement
         + the damping
 
-Both parts are positive semidefinite by construction, so there is nothing to shift or to scale. The
-inertial chain, whose stiffness ruins block-Jacobi, is solved exactly; what is left for the iterations
-is how poses depend on each other through landmarks.
+Both parts are positive semidefinite by construction, so no shift or scaling is needed. The
+inertial chain, whose stiffness ruins block-Jacobi, is solved exactly; the iterations only solve for
+the coupling of poses by landmarks.
 
-Edges that join vertices far apart, such as loop closures, would fill the factor. Of those only the
-diagonal blocks of their vertices are taken, unless an edge joins two parts that nothing else joins.
+Edges between distant vertices, such as loop closures, would fill the factor. Only the diagonal blocks
+of their vertices are used, unless an edge is the only connection of two parts of the graph.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""A least-squares problem: terms, which nodes may move, and its normal equations."""
+"""A least-squares problem: terms, fixed directions of nodes, and its normal equations."""
 
 import dataclasses
 from collections.abc import Callable, Sequence

@@ -11,7 +11,7 @@ from maplab_py.array_types import F64
 
 
 class Schedule(Enum):
-    """Schedule by which the radius follows the gain, the share of the promised decrease that came true."""
+    """Schedule of the radius by the gain: actual over predicted decrease of the cost."""
 
     CERES = "ceres"  # radius / max(1/3, 1 - (2 gain - 1)^3); rejected: / 2, 4, 8 ...
     STEP_QUALITY = "step_quality"  # the same, but bolder after nearly perfect steps
@@ -34,9 +34,9 @@ class TrustRegion:
     """The radius of one optimisation.
 
     CERES follows Madsen, Nielsen and Tingleff (Methods for Non-Linear Least Squares Problems, 2004,
-    section 3.2) as Ceres does. STEP_QUALITY does the same but for steps that came out as promised to
-    two percent: they widen the radius by up to 100 instead of 3. Where the model is that good the
-    radius only holds back; half of the iterations are saved on clean maps, none are lost on others.
+    section 3.2) as Ceres does. STEP_QUALITY differs for steps whose decrease is within two percent of
+    the prediction: they enlarge the radius by up to 100 instead of 3. Where the model is so accurate the
+    radius only limits progress; half of the iterations are saved on clean maps, none are lost on others.
     """
 
     def __init__(

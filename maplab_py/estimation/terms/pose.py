@@ -93,7 +93,7 @@ class RelativePoseTerm(FixedMeasurements):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class SwitchedRelativePoseTerm(FixedMeasurements):
-    """Relative poses T_A_B that switches, states in `switch_block`, turn down or off.
+    """Relative poses T_A_B with switch variables, states in `switch_block`, that reduce their weight.
 
     A prior on the switches (`PriorTerm` at 1) keeps those of consistent measurements on.
     """

@@ -1,4 +1,4 @@
-"""Priors: what is known of states before any measurement."""
+"""Priors on states."""
 
 import numpy as np
 

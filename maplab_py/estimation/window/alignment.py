@@ -1,4 +1,4 @@
-"""T_G_M from observations of a map while all poses stay where they are (SWL).
+"""T_G_M from observations of a map with all poses in M fixed (SWL).
 
 Source: Oleynikova et al., Real-Time Visual-Inertial Localization for Aerial and Ground Robots, IROS 2015,
 as Schneider 2019, Paper I, section 4.1 describes it.

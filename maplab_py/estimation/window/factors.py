@@ -111,8 +111,8 @@ _POSE, _VELOCITY = 6, 6
 class Standstill:
     """Factors of edges at rest: no change of pose, no velocity at both ends.
 
-    Together with the inertial edge, zero velocity at both ends says that the mean acceleration is
-    zero against gravity and bias, and no turn that the mean angular velocity is the bias.
+    With the inertial edge, zero velocity at both ends makes the mean measured acceleration that of
+    gravity plus bias, and zero rotation makes the mean angular velocity the bias.
     """
 
     def __init__(self, kernel: ModuleType, options: WindowOptions) -> None:

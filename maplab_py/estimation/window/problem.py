@@ -1,4 +1,4 @@
-"""A window as a least-squares problem: one dense system, landmarks eliminated as it is filled in."""
+"""A window as a least-squares problem: one dense system, from which landmarks are eliminated on the fly."""
 
 import dataclasses
 from types import ModuleType

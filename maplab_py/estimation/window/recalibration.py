@@ -1,8 +1,8 @@
 """A window expressed with another calibration of its sensors.
 
-The poses of the cameras relative to each other stay, for images have shown them, and so does the newest state
-of the IMU; the other states follow from both. Biases change so that the samples are explained as before. The
-prior is that of the new states, and doubts what the old calibration may have distorted.
+Relative poses of the cameras, which images determine, and the newest pose of the IMU do not change; the
+other states follow from both. Biases change such that corrected samples stay the same. The marginal prior
+is transformed to the new states, and inflated where the old calibration may have distorted it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The states of a window: a value, of which steps make new ones."""
+"""The states of a window, an immutable value; a step returns new states."""
 
 from __future__ import annotations
 

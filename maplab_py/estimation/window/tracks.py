@@ -1,4 +1,4 @@
-"""Tracks in the window: their observations, and those of them that are landmarks."""
+"""Tracks in the window, their observations, and estimates of tracks that are landmarks."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""Tracks that become landmarks: enough parallax, and errors as small as their uncertainty allows."""
+"""Triangulation of tracks into landmarks: enough parallax, and errors that agree with their uncertainty."""
 
 from types import ModuleType
 

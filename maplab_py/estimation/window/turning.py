@@ -1,4 +1,4 @@
-"""Turning on the spot: told from slow motion by parallax over a longer time, and by a velocity of zero."""
+"""Pure rotation, distinguished from slow motion by parallax over a longer time and by zero velocity."""
 
 import numpy as np
 
