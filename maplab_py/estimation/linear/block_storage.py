@@ -12,6 +12,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, I32, I64, Mask
 from maplab_py.compilation import compiled
+from maplab_py.estimation.linear.blocks_of_six import add_block, add_transposed
 from maplab_py.estimation.linear.symbolic import FrontPlan
 
 
@@ -74,6 +75,9 @@ def add_blocks(
 ) -> None:
     """Add blocks (B, d, d) to the numbers of the storage, one after another."""
     d = layout.node_size
+    if d == 6:
+        _add_blocks_of_six(layout, rows, cols, places, values, numbers.reshape(-1, 6))
+        return
     for block in range(len(rows)):
         row, col = rows[block], cols[block]
         if layout.position[row] >= layout.position[col]:
@@ -86,6 +90,21 @@ def add_blocks(
             for c in range(d):
                 for r in range(d):
                     numbers[start + c * leading + r] += values[block, c, r]
+
+
+@compiled()
+def _add_blocks_of_six(
+    layout: BlockLayout, rows: I32, cols: I32, places: I32, values: F64, numbers: F64
+) -> None:
+    for block in range(len(rows)):
+        row, col = rows[block], cols[block]
+        is_lower = layout.position[row] >= layout.position[col]
+        node = col if is_lower else row
+        at, leading = (layout.column_start[node] + places[block]) // 6, layout.leading[node] // 6
+        if is_lower:
+            add_block(numbers, at, leading, values, block)
+        else:
+            add_transposed(numbers, at, leading, values, block)
 
 
 @compiled()

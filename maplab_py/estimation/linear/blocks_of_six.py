@@ -130,3 +130,25 @@ def subtract_square(L: Matrix, width: int, local: I64, cols: int, target: Matrix
                 _subtract_product(
                     result, rows, column + local[i], step, left + i, left + j, leading
                 )
+
+
+@rows_of_six
+def add_transposed(numbers: F64, at: int, leading: int, values: F64, block: int) -> None:
+    """Add the transposed block of some (B, 6, 6) to a block of a panel."""
+    for c in range(6):
+        numbers[at + c * leading] = numbers[at + c * leading] + values[block, c]
+
+
+@rows_of_six
+def add_block(numbers: F64, at: int, leading: int, values: F64, block: int) -> None:
+    """Add a block of some (B, 6, 6) to a block of a panel."""
+    for c in range(6):
+        column = row(
+            values[block, 0, c],
+            values[block, 1, c],
+            values[block, 2, c],
+            values[block, 3, c],
+            values[block, 4, c],
+            values[block, 5, c],
+        )
+        numbers[at + c * leading] = numbers[at + c * leading] + column
