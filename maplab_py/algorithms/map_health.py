@@ -81,7 +81,7 @@ class MapHealth(Report):
 
     @property
     def advice(self) -> str:
-        """Return what to mend first."""
+        """Return the fault to repair first."""
         first = cause(self.findings)
         return f"{first.check}: {first.remedy}" if first is not None and first.remedy else ""
 

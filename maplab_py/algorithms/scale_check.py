@@ -27,14 +27,14 @@ _SMALLEST, _LARGEST = 0.7, 1.4
 
 @dataclasses.dataclass(frozen=True)
 class MissionScale:
-    """Scale of one mission: lengths of the map as multiples of those that the IMU says."""
+    """Scale of one mission: lengths of the map as multiples of those by the IMU."""
 
     mission: int  # row
     scale: float
 
     @property
     def doubt(self) -> str:
-        """Return what is wrong; empty if nothing is."""
+        """Return the contradiction in words; empty if there is none."""
         if _SMALLEST <= self.scale <= _LARGEST:
             return ""
         return (

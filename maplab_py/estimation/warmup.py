@@ -25,7 +25,7 @@ _RESIDUALS = (
 
 
 def optimizer_jobs() -> dict[str, Callable[[], None]]:
-    """Return by name what compiles kernels that are needed together."""
+    """Return functions by name, each of which compiles kernels that are used together."""
     jobs: dict[str, Callable[[], None]] = {
         name: partial(_compile_residual, name) for name in _RESIDUALS
     }

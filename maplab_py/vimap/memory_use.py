@@ -12,7 +12,7 @@ from maplab_py.vimap.vi_map import VIMap
 
 
 class SharedColumns:
-    """Sums up the bytes of maps; a column counts for the first map that has it."""
+    """Bytes of several maps; a shared column counts for the first map only."""
 
     def __init__(self) -> None:
         """Start without maps."""
@@ -40,7 +40,7 @@ class SharedColumns:
 
 
 def forget_lookups(vi_map: VIMap) -> None:
-    """Give back what a map has derived from its columns; it is computed again when it is needed."""
+    """Free what a map has derived from its columns; it is computed again on demand."""
     fields = {field.name for field in dataclasses.fields(vi_map)}
     for name in [name for name in vars(vi_map) if name not in fields]:
         vars(vi_map).pop(name, None)

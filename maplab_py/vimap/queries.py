@@ -15,7 +15,7 @@ from maplab_py.vimap.vi_map import VIMap
 
 
 def mission_labels(vi_map: VIMap) -> list[str]:
-    """Return what each mission (M) is called: its name, else the beginning of its id.
+    """Return the label of each mission (M): its name, else the prefix of its id.
 
     A name that several missions have is followed by the beginning of the id.
     """

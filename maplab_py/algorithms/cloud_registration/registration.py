@@ -1,4 +1,4 @@
-"""Registration of two clouds by generalized ICP, and how well the result is determined.
+"""Registration of two clouds by generalized ICP, and its information matrix.
 
 Sources: Segal, Haehnel and Thrun, Generalized-ICP (RSS 2009); small_gicp (Koide, JOSS 2024) computes it.
 Perturbations of poses are on the right, [dp, dtheta], both in the frame of the source.
@@ -69,7 +69,7 @@ class PreparedCloud:
 
 
 def prepare_cloud(p_S: F64, voxel_size_m: float, name: str) -> PreparedCloud:
-    """Thin a cloud (N, 3) and compute what its registration needs.
+    """Thin a cloud (N, 3), and compute its covariances and search trees.
 
     Raises:
         UserError: small_gicp is not installed.

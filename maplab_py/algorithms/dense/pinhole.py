@@ -45,7 +45,7 @@ class Pinhole:
 
 
 def inscribed(views: list[tuple[Camera, F64]], width_px: int, height_px: int) -> Pinhole:
-    """Return the perspective camera that sees as much as possible of what all cameras see.
+    """Return the perspective camera with the largest view that all cameras share.
 
     All its pixels lie inside the image of every camera, as with OpenCV's stereoRectify and alpha = 0,
     unless a lens is wider than a perspective image can show.

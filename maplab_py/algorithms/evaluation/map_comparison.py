@@ -26,7 +26,7 @@ _NONE = Difference(0, 0.0, 0.0)
 
 
 def compare_maps(first: VIMap, second: VIMap) -> MapComparisonReport:
-    """Compare what two maps have in common, and count what only one of them has.
+    """Compare the common rows of two maps, and count rows that only one of them has.
 
     Rows belong together if their ids are equal. An observation is a keypoint, by its frame and place
     there, with its landmark. Poses and landmarks are compared in G.

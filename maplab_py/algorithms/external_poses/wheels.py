@@ -38,7 +38,7 @@ class AttachedWheels(NamedTuple):
 def attach_wheels(
     vi_map: VIMap, mission: int, track: WheelTrack, options: WheelOptions
 ) -> AttachedWheels:
-    """Join neighbouring vertices of a mission (row) by what wheels measured.
+    """Join neighbouring vertices of a mission (row) by wheel odometry edges.
 
     Edges relate the frames of the wheel sensor at two vertices; its poses are interpolated to their times.
 

@@ -1,6 +1,6 @@
 """Evidence for landmarks: in which sessions they were predicted visible, and matched.
 
-It is kept in a field of the landmark's message that other programs skip. Sessions are counted, and within a
+It is stored in a field of the landmark's message that other programs skip. Sessions are counted, and within a
 session places, not images: images of one place fail for the same reason.
 """
 

@@ -65,7 +65,7 @@ class PairGate:
 
 @dataclasses.dataclass(frozen=True)
 class NearMiss:
-    """A refused closure that is near to passing."""
+    """A refused closure that nearly passes the gates."""
 
     closure: str
     verdict: str
@@ -198,7 +198,7 @@ def explain_pair(
 
 
 def explain_mission(vi_map: VIMap, mission: int) -> MissionExplanation:
-    """Return what the record holds of the closures between a mission (row) and every other one."""
+    """Return the recorded closures between a mission (row) and every other one."""
     names = [to_hex(words)[:8] for words in vi_map.missions.id]
     known = vi_map.baseframes.is_known[vi_map.missions.baseframe]
     record = read_record(vi_map).closures

@@ -180,7 +180,7 @@ class Agreement:
     squared_sigmas: F64  # (N,) squared Mahalanobis distance, three degrees of freedom
 
     def is_doubtful(self, distance_m: float) -> Mask:
-        """Return which pairs (N,) are one point less likely, or because nobody knows their depth.
+        """Return which pairs (N,) are unlikely the same point, or far apart since their depths are uncertain.
 
         These are the tenth of the true pairs that is farthest apart in deviations, and pairs farther
         apart than a distance and a tenth of their depth.

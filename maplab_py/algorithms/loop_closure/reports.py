@@ -126,7 +126,7 @@ class ClosureReport(Report):
     notes: tuple[str, ...] = ()
 
     def display(self) -> ClosureTable:
-        """Return the closures with what was decided on them in the first columns."""
+        """Return the closures with their verdicts in the first columns."""
         reasons = ", ".join(f"{count} {reason}" for reason, count in self.refused.items())
         summary = (
             f"{self.recorded} recorded, {self.accepted} accepted, largest gap "

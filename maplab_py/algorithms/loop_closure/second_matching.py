@@ -42,7 +42,7 @@ def match_again(
     which: I64,
     progress: Progress,
 ) -> tuple[Matches, Candidates]:
-    """Return some candidates with what the network matches in addition, and all matches.
+    """Return some candidates with additional matches by the network, and all matches.
 
     Images of the same camera at the query and at the place's vertex are compared.
 

@@ -239,7 +239,7 @@ def map_before(vi_map: VIMap, record: Record) -> VIMap:
 
 
 def difference(before: VIMap, after: VIMap) -> bytes:
-    """Return what leads from the map after an update back to that before it."""
+    """Return the differences that restore the map before an update."""
     texts = to_hex_list(before.resources.id[edits.texts_of_missions(before)])
     sensors = write_sensors(before.sensors)
     head: dict[str, Any] = {"sensors": sensors, "texts": texts, "columns": []}

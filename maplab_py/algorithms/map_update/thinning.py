@@ -66,7 +66,7 @@ def thin(
     persistence: PersistenceOptions,
     progress: Progress = SILENT,
 ) -> tuple[VIMap, Thinned]:
-    """Remove landmarks that no longer exist, and what exceeds the budget.
+    """Remove landmarks that no longer exist, and those and vertices beyond the budget.
 
     Args:
         new: Missions (M,) whose vertices keep their inertial measurements.

@@ -20,7 +20,7 @@ _SAME_CLOCK_S, _SIGMAS = 2e-3, 4.0
 
 
 def correct(diagnosis: doctor.Diagnosis) -> tuple[RecordedSensors, tuple[str, ...]]:
-    """Return the sensors with what a diagnosis shows to be off, and what has changed or is to be changed.
+    """Return the sensors corrected by a diagnosis, and descriptions of the changes made and still needed.
 
     Units and axes are of the samples, not of the calibration: they are only told.
     """

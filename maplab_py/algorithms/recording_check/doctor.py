@@ -86,14 +86,14 @@ def report(diagnosis: Diagnosis, recording: protocol.Recording) -> RecordingChec
 
 
 def first_cause(diagnosis: Diagnosis) -> Finding | None:
-    """Return what is wrong with a recording; None if nothing speaks against it."""
+    """Return the first cause of a recording's faults; None without a fault."""
     first = cause(diagnosis.findings)
     is_grave = first is not None and first.verdict in (Verdict.WRONG, Verdict.HOPELESS)
     return first if is_grave else None
 
 
 def check_first_seconds(recording: protocol.Recording, stream: StreamOptions) -> tuple[str, ...]:
-    """Return a line on what the first seconds show to be wrong, none if all is well.
+    """Return a line on faults in the first seconds, none if there are none.
 
     Raises:
         UserError: No map can be made of the recording.
@@ -110,7 +110,7 @@ def check_first_seconds(recording: protocol.Recording, stream: StreamOptions) ->
 
 
 def explain_refusal(diagnosis: Diagnosis | None, name: str, reason: str) -> str:
-    """Return why odometry has not started: what is wrong with the recording, else the given reason."""
+    """Return why odometry has not started: faults of the recording, else the given reason."""
     first = None if diagnosis is None else first_cause(diagnosis)
     if first is None:
         return reason
@@ -118,9 +118,9 @@ def explain_refusal(diagnosis: Diagnosis | None, name: str, reason: str) -> str:
 
 
 def check_map(vi_map: VIMap) -> tuple[Finding, ...]:
-    """Return what the tracks and samples of the longest mission say against the calibration.
+    """Return how tracks and samples of the longest mission contradict the calibration.
 
-    The first seconds of a recording may not show it, and a map bends by it.
+    The first seconds of a recording may not show an error that deforms its map.
     """
     return tuple(f for f in map_findings(vi_map) if f.verdict in (Verdict.WRONG, Verdict.NOTE))
 

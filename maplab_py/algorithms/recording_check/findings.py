@@ -30,7 +30,7 @@ _WEIGHT = {
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """Result of one check: what the recording shows, what it should, and what mends it."""
+    """Result of one check: observed value, expected value, and remedy."""
 
     check: str
     observed: str
@@ -47,34 +47,34 @@ class Finding:
 
 @dataclasses.dataclass(frozen=True)
 class Check:
-    """A check and what it expects, of which the finding follows from what is observed."""
+    """A check with its expectation; its finding follows from the observed value."""
 
     name: str
     expected: str
 
     def ok(self, observed: str) -> Finding:
-        """Return that all is well."""
+        """Return a finding without fault."""
         return Finding(self.name, observed, self.expected, Verdict.OK)
 
     def unknown(self, reason: str) -> Finding:
-        """Return that the recording does not show it."""
+        """Return a finding that the recording cannot decide."""
         return Finding(self.name, reason, self.expected, Verdict.UNKNOWN)
 
     def note(self, observed: str, remedy: str) -> Finding:
-        """Return what works, but could be better."""
+        """Return a finding that can be improved."""
         return Finding(self.name, observed, self.expected, Verdict.NOTE, remedy)
 
     def wrong(self, observed: str, remedy: str) -> Finding:
-        """Return what is wrong."""
+        """Return a finding of a fault."""
         return Finding(self.name, observed, self.expected, Verdict.WRONG, remedy)
 
     def hopeless(self, observed: str, remedy: str) -> Finding:
-        """Return why no map can be made."""
+        """Return a finding that prevents any map."""
         return Finding(self.name, observed, self.expected, Verdict.HOPELESS, remedy)
 
 
 def cause(findings: Sequence[Finding]) -> Finding | None:
-    """Return the finding to mend first: the first of the gravest; None where all is well.
+    """Return the finding to repair first: the first of the most severe; None without a fault.
 
     Checks run in the order of causes: what an earlier one finds may be why a later one complains.
     """

@@ -80,7 +80,7 @@ class MendedRecording(RecalibratedRecording):
     def items(
         self, start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[protocol.Item]:
-        """Yield the items of the recording, mended; see `Recording`."""
+        """Yield the corrected items of the recording; see `Recording`."""
         old = [camera.time_offset_ns for camera in self.plain.device.cameras]
         shift_ns = [
             camera.time_offset_ns - before_ns
@@ -101,7 +101,7 @@ class MendedRecording(RecalibratedRecording):
 def mended(
     recording: protocol.Recording, diagnosis: doctor.Diagnosis, stream: options.StreamOptions
 ) -> MendedRecording | None:
-    """Return a recording with what its diagnosis finds wrong, and can put right; None if nothing."""
+    """Return a recording with the faults of its diagnosis corrected; None if there are none to correct."""
     if (
         any(f.verdict is findings.Verdict.HOPELESS for f in diagnosis.findings)
         or not diagnosis.cameras

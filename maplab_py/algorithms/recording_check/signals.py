@@ -129,7 +129,7 @@ class _Reader:
             self._take(item, looks)
 
     def signals(self, restart: str) -> Signals:
-        """Return what was read."""
+        """Return the signals."""
         none = ImuSignal(np.zeros(0, dtype=np.int64), np.zeros((0, 6)), np.zeros(0, dtype=np.bool_))
         imu = none
         if self._batches:

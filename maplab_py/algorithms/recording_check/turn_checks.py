@@ -150,7 +150,7 @@ def check_scale(cameras: Sequence[CameraTurns]) -> Finding:
 
 
 def check_shutter(cameras: Sequence[CameraTurns], models: Sequence[Camera]) -> Iterator[Finding]:
-    """Yield a finding on the shutter of each camera that looks as if it rolled."""
+    """Yield a finding on each camera that seems to have a rolling shutter."""
     for row, (camera, model) in enumerate(zip(cameras, models, strict=True)):
         fit = camera.hand_eye
         known_s = 1e-9 * model.line_delay_ns * model.height_px

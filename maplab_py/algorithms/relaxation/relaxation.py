@@ -39,7 +39,7 @@ _NUM_WORST = 10
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Relaxed:
-    """A relaxed map, and what became of every closure that was used."""
+    """A relaxed map, and the verdict on every closure that was used."""
 
     vi_map: VIMap
     report: RelaxationReport
@@ -171,7 +171,7 @@ def _with_switches(vi_map: VIMap, closures: LoopClosureEdges, weight: F64) -> VI
 
 
 def move_vertices(vi_map: VIMap, rows: I64, T_G_I: F64) -> VIMap:
-    """Give some vertices (rows) the poses T_G_I[rows] of (V, 7), by what they are in M.
+    """Set the poses of some vertices (rows) in G to T_G_I[rows] of (V, 7), by their poses in M.
 
     Velocities turn with their vertices; landmarks follow without a change.
     """

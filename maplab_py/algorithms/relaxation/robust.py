@@ -53,7 +53,7 @@ _SUM_SIGMAS = 3.0
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Solution:
-    """Poses of all vertices and what became of the loop closures."""
+    """Poses of all vertices, and verdicts on the loop closures."""
 
     T_G_I: F64  # (V, 7)
     weight: F64  # (E,) of every closure, 1 = trusted, 0 = switched off
@@ -111,7 +111,7 @@ class _Graph:
         return self._solution(T, np.ones(len(self.loops)), iterations)
 
     def annealed(self) -> Solution:
-        """Lower the switch penalty to the one asked for; of all starts the least cost wins."""
+        """Lower the switch penalty to the given value; return the start with the least cost."""
         penalty = self.options.switch_prior
         solutions: list[Solution] = []
         for share in _STARTS:
@@ -312,7 +312,7 @@ def variance_factor(u: F64) -> float:
 
 
 def independent_errors(error: F64, uncertainty: F64, counts: Mask) -> F64:
-    """Return the squared normalised errors (E,) of closures against what all OTHERS say.
+    """Return the squared normalised errors (E,) of closures as predicted by all OTHERS.
 
     A closure that counts pulls the solution and looks better than it is; one that does not count is
     measured against poses that are uncertain themselves. Both are put right by the covariance of the

@@ -23,7 +23,7 @@ _AXIS_WORDS = {"about", "x", "y", "z", "xy", "xz", "yz", "u", "v", "w"}
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Evidence:
-    """Statement of the data of a segment on errors of the present calibration."""
+    """Score and information of a segment's data on errors of the current calibration."""
 
     begin_ns: int
     end_ns: int
@@ -73,7 +73,7 @@ def families(parameters: Parameters) -> dict[str, I64]:
 def strongest_contradiction(
     evidence: Sequence[Evidence], parameters: Parameters, tolerance: F64
 ) -> Contradiction | None:
-    """Return what the newest segments contradict most; None of a single segment, which may be an accident.
+    """Return the strongest contradiction of the newest segments; None of a single segment, an accident maybe.
 
     Args:
         evidence: Of the segments of a session, in the order of time.

@@ -66,7 +66,7 @@ by 0.5 ms."""
 
 
 def may_free(options: VIOptimizationOptions, report: VIOptimizationReport) -> bool:
-    """Tell whether calibration may be freed after an optimisation that held all of it.
+    """Return whether calibration may be freed after an optimisation with all of it fixed.
 
     It must have converged, and the solver must be one that supports cameras as states.
     """
@@ -210,7 +210,7 @@ def _chosen(step: _Step, known: list[int]) -> list[str]:
 
 
 def freed_note(options: VIOptimizationOptions, report: VIOptimizationReport) -> str:
-    """Return in words what was freed, and what was found."""
+    """Return a line on the groups that were freed and their largest changes."""
     return (
         "the residuals contradict the calibration, so this was estimated: "
         f"{', '.join(describe_freed(options, report))} (--ba_calibration=fixed keeps it)"

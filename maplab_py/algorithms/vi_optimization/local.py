@@ -40,7 +40,7 @@ def optimize_around(
     max_fixed: int,
     progress: Progress = SILENT,
 ) -> tuple[VIMap, LocalReport]:
-    """Optimise vertices (rows) and what they touch.
+    """Optimise vertices (rows) and their neighbours.
 
     Args:
         vertices: New vertices; always free, unless they are a whole cluster without a fixed vertex.

@@ -117,7 +117,7 @@ def build(
     fixed_vertices: I64 | None = None,
     progress: Progress = SILENT,
 ) -> MapProblem:
-    """Build the problem of some missions (rows, None = all); some vertices (rows) may be held fixed.
+    """Build the problem of some missions (rows, None = all); some vertices (rows) may be fixed.
 
     Raises:
         UserError: Flags contradict each other.

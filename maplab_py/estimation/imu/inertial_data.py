@@ -97,7 +97,7 @@ class InertialData:
         return len(self.sample_start) - 1
 
     def with_biases(self, gyro_bias: ArrayLike, accel_bias: ArrayLike) -> EdgeSamples:
-        """Return what kernels read, with biases (E, 3) or (3,) [rad/s, m/s^2]."""
+        """Return the kernels' arguments, with biases (E, 3) or (3,) [rad/s, m/s^2]."""
         shape = (len(self), 3)
         return EdgeSamples(
             self.sample_start,

@@ -118,7 +118,7 @@ def propagate(
     accel_bias: ArrayLike,
     gravity_M: ArrayLike,
 ) -> tuple[F64, F64]:
-    """Integrate the samples of every edge from its first sample on, biases held constant.
+    """Integrate the samples of every edge from its first sample on, with constant biases.
 
     Args:
         data: Samples of E edges, N in all.

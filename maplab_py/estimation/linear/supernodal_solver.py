@@ -246,12 +246,12 @@ class SupernodalCholesky:
         self._is_factorised = False
 
     def clear(self) -> None:
-        """Set the matrix to zero; the factor is gone."""
+        """Set the matrix to zero, which discards the factor."""
         self._is_factorised = False
         self.numbers.fill(0.0)
 
     def places(self, rows: I32, cols: I32) -> I32:
-        """Return what `add` needs to know about blocks (B,) of the pattern."""
+        """Return the places of blocks (B,) of the pattern, for `add`."""
         return np.asarray(panel_places(self.plan, self.layout.position, rows, cols))
 
     def add(self, rows: I32, cols: I32, places: I32, values: F64) -> None:

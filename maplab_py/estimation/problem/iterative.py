@@ -119,7 +119,7 @@ class IterativeProblem(Problem):
     # -- equations -------------------------------------------------------------------------------
 
     def relinearize(self, states: States) -> bool:
-        """Move the terms' linearisation points to the states; tell whether costs may have changed."""
+        """Move the terms' linearisation points to the states; return whether costs may have changed."""
         has_changed = super().relinearize(states)
         if has_changed:
             self._evaluated = None
@@ -367,7 +367,7 @@ def compile_kernels() -> None:
 
 
 def compile_without_images() -> None:
-    """Compile what problems without landmarks need."""
+    """Compile the kernels of problems without landmarks."""
     zero = np.zeros((1, 3))
     prior = PosePrior(np.zeros(1, dtype=np.int64), se3.identity(1), np.eye(6))
     states = States(se3.identity(1), zero, zero, zero, zero)

@@ -52,7 +52,7 @@ class PoseSystem(NamedTuple):
 
 
 class TiltColumns(NamedTuple):
-    """Tilt priors as the compiled loops take them."""
+    """Arguments of the compiled loops: tilt priors."""
 
     vertex: I64  # (N,)
     node: I64  # (N,), -1 where the vertex is fixed

@@ -151,7 +151,7 @@ class Problem:
         return round(float(np.trace(self._projector, axis1=1, axis2=2).sum()))
 
     def relinearize(self, states: States) -> bool:
-        """Move the terms' linearisation points to the states; tell whether costs may have changed."""
+        """Move the terms' linearisation points to the states; return whether costs may have changed."""
         changed = [term.relinearize(states) for term in self.factors]
         return any(changed)
 
@@ -257,7 +257,7 @@ class Problem:
         return np.asarray(np.einsum("nij,njk->nik", self._projector, columns))
 
     def name_of_node(self, states: States, node: int) -> str:
-        """Say in words which state a node belongs to."""
+        """Return the description of a node's state."""
         if node < states.num_vertex_nodes:
             return f"the {NODE_NAMES[node % NODES_PER_VERTEX]} of vertex {node // NODES_PER_VERTEX}"
         for block in states.blocks:

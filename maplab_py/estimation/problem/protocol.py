@@ -42,10 +42,10 @@ class LeastSquares(Protocol[S, L]):
     """A problem that `solver.optimize_states` minimises."""
 
     def relinearize(self, states: S) -> bool:
-        """Move the terms' linearisation points to the states; tell whether costs may have changed."""
+        """Move the terms' linearisation points to the states; return whether costs may have changed."""
 
     def linearize(self, states: S, damping: float) -> L:
-        """Form the normal equations; what is eliminated in doing so is damped."""
+        """Form the normal equations, with damping of the eliminated states."""
 
     def try_step(self, states: S, linear: L, damping: float) -> Step[S]:
         """Return the damped step from the states at which the equations were formed.

@@ -26,7 +26,7 @@ _NEAR = 0.05
 
 
 def added_damping(diagonal: F64, damping: float) -> F64:
-    """Return what damping adds to the diagonal of normal equations."""
+    """Return the damping of the diagonal of normal equations."""
     return np.asarray(damping * np.clip(diagonal, _SMALLEST_DAMPED, _LARGEST_DAMPED))
 
 
@@ -97,7 +97,7 @@ class StepJudge:
         return max(now, (self._reference - new_cost) / (self._since_reference + promised))
 
     def accept(self, new_cost: float, promised: float) -> bool:
-        """Take a step; tell whether it gives the least cost so far."""
+        """Accept a step; return whether its cost is the smallest so far."""
         self._cost = new_cost
         self._since_reference += promised
         self._since_highest += promised
@@ -121,7 +121,7 @@ class StepJudge:
 
 
 class Decreases:
-    """The last decreases of the cost, and what they let expect."""
+    """The last decreases of the cost, and a prediction of the next ones."""
 
     def __init__(self) -> None:
         """Begin without any decrease."""

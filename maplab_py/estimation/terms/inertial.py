@@ -57,7 +57,7 @@ class InertialTerm:
         self.nodes = np.stack(columns, axis=1)
 
     def relinearize(self, states: States) -> bool:
-        """Integrate edges again whose biases are far from where they were; tell whether any are."""
+        """Integrate edges again whose biases have changed much; return whether there are any."""
         b_g, b_a = states.gyro_bias[self._a], states.accel_bias[self._a]
         old = self._measured
         if old is None:

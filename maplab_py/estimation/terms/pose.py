@@ -81,7 +81,7 @@ class RelativePoseTerm(FixedMeasurements):
         return np.concatenate([pose_nodes(self.first), pose_nodes(self.second), *more], axis=1)
 
     def arguments(self, states: States) -> F64:
-        """Return what the kernel is called with (N, 28)."""
+        """Return the kernel's arguments (N, 28)."""
         poses = states.T_G_I
         T_I_S = self.T_I_S if self.mounting is None else self.mounting.T_I_S(states)
         return np.concatenate([poses[self.first], poses[self.second], T_I_S, self.T_SA_SB], 1)

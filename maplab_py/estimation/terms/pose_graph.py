@@ -24,7 +24,7 @@ def _plain(array: NDArray[T]) -> NDArray[T]:
 
 
 class EdgeColumns(NamedTuple):
-    """Relative poses as the compiled loops take them."""
+    """Arguments of the compiled loops: relative poses."""
 
     first: I64  # (E,) vertex A
     second: I64  # (E,) vertex B

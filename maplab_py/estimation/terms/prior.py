@@ -70,7 +70,7 @@ class PosePrior(FixedMeasurements):
 
     @property
     def determines_poses(self) -> bool:
-        """Whether the prior says something about every direction of every pose."""
+        """Whether the prior has information on every direction of every pose."""
         return bool(np.all(np.linalg.matrix_rank(self._root) == 6))
 
     def evaluate(self, states: States) -> tuple[F64, F64]:

@@ -28,7 +28,7 @@ class FactorTerm(Protocol):
         """Robust loss and its scale in sigmas."""
 
     def relinearize(self, states: States) -> bool:
-        """Update data that depend on a linearisation point; tell whether costs may have changed.
+        """Update data that depend on a linearisation point; return whether costs may have changed.
 
         The solver calls this before it linearises (see `FixedMeasurements`).
         """

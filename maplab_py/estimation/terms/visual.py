@@ -190,7 +190,7 @@ class VisualTerms:
         return np.concatenate([np.zeros_like(uv_px), rows], axis=1)
 
     def refresh(self, states: States) -> bool:
-        """Compute the pixels' velocities again; tell whether there are any."""
+        """Compute the pixels' velocities again; return whether there are any."""
         if self._motion is None:
             return False
         at, vertex = self._at(states), self.observations.vertex
@@ -233,7 +233,7 @@ class VisualTerms:
     def linearize(
         self, states: States, damping: float, solver: SupernodalCholesky, places: VisualPlaces
     ) -> NodeSystem:
-        """Eliminate the landmarks; add what is left to the solver's matrix and the result."""
+        """Eliminate the landmarks; add the Schur complement to the solver's matrix and the result."""
         cost = np.zeros(self.num_chunks)
         for sums in self._sums:
             sums.fill(0.0)

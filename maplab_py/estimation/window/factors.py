@@ -19,7 +19,7 @@ from maplab_py.geometry import se3
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Part:
-    """Some of the factors: edges, consecutive ones, and what is known of single frames."""
+    """Part of the factors: consecutive edges, and factors of single frames."""
 
     edges: slice
     frames: slice
@@ -30,7 +30,7 @@ EVERY = Part(slice(None), slice(None))
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FrameFactors:
-    """Inertial edges, walk of the biases, and what is known of frames at rest."""
+    """Inertial edges, random walk of the biases, and factors of frames at rest."""
 
     chain: inertial.InertialChain
     standstill: Standstill

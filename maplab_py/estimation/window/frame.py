@@ -1,4 +1,4 @@
-"""Input and result of the smoother for a frame, and the state it starts from."""
+"""Input and result of the smoother for a frame, and the initial state."""
 
 import dataclasses
 from enum import Enum, IntFlag
@@ -56,7 +56,7 @@ class WindowFrame:
 
 @dataclasses.dataclass(eq=False)
 class FrameRows:
-    """Columns of the F frames in a window that are not estimated, in the order of time."""
+    """Columns of the F frames in a window that are not estimated, ordered by time."""
 
     time_ns: I64 = dataclasses.field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     is_keyframe: Mask = dataclasses.field(default_factory=lambda: np.zeros(0, dtype=np.bool_))

@@ -55,7 +55,7 @@ class InertialChain:
         self._failed: I64 = np.zeros(0, dtype=np.int64)  # `ImuPart` of every edge
 
     def take_imu(self, imu: Imu) -> None:
-        """Read samples as those of an IMU; edges stay as they are integrated."""
+        """Interpret samples as those of an IMU, without integrating edges again."""
         imus = tuple(_with_failed(imu, ImuPart(parts)) for parts in range(4))
         self._imus = InertialData(
             np.zeros(1, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros((0, 6)), imus,
@@ -182,7 +182,7 @@ class InertialChain:
         return self._samples[-1]
 
     def relinearize(self, motion: F64) -> bool:
-        """Integrate edges again whose biases (in F, 9) have moved far; tell whether any have."""
+        """Integrate edges again whose biases (in F, 9) have changed much; return whether there are any."""
         self._integrate_stale()
         biases = motion[: len(self), 3:].copy()
         outdated = outdated_edges(biases, self._integrated_at, self._seen_at, self.duration_s)

@@ -73,7 +73,7 @@ class LocalizedSmoother(smoother.FixedLagSmoother):
         return self._latest_terms
 
     def start_base_frame(self, T_G_M: F64) -> None:
-        """Make T_G_M (7,) a state, linearised there; what was known of an earlier one is removed.
+        """Make T_G_M (7,) a state, linearised there; information on an earlier one is removed.
 
         Raises:
             EstimationError: The smoother has not been started.

@@ -56,7 +56,7 @@ class MapTracks:
         return np.isin(track_id, self.matches.track_id)
 
     def add(self, matches: MapMatches, tracks: Tracks) -> int:
-        """Associate tracks that the window knows; return how many were new.
+        """Associate tracks in the window; return the number of new associations.
 
         Matches of tracks or landmarks that are associated already, or were refused, are left out.
         """

@@ -1,4 +1,4 @@
-"""Marginalization: states that leave the window become a prior on those that stay."""
+"""Marginalization: states that leave the window become a prior on the remaining states."""
 
 import dataclasses
 
@@ -18,7 +18,7 @@ def marginalized(
     *,
     frame: int | None,
 ) -> WindowPrior:
-    """Return the prior that takes the place of all landmarks of a problem and, optionally, a frame.
+    """Return the marginal prior of all landmarks of a problem and, optionally, a frame.
 
     Frames that the result touches are fixed from now on at their states, or stay fixed where they
     were. A landmark is not touched: it is anchored in a frame that stays, or eliminated altogether.

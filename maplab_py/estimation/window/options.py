@@ -15,7 +15,7 @@ _OUTLIER_MEDIANS, _LEAST_GATE_SIGMAS = 8.0, 0.5
 
 
 class WindowOptions(Options, prefix="vio_"):
-    """Size of the window, choice of keyframes and landmarks, and when an update is good enough."""
+    """Size of the window, choice of keyframes and landmarks, and convergence criteria."""
 
     num_keyframes: int = 0
     """Keyframes in the window; 0 = 7 of several cameras, and 12 of a single camera, which sees distances by

@@ -161,14 +161,14 @@ class WindowPrior:
         return dataclasses.replace(prior, root=root, residual=residual, x0=x0, is_base_fixed=False)
 
     def without_base(self) -> WindowPrior:
-        """Return the prior of the frames: what it says of the base frame is marginalised."""
+        """Return the prior of the frames, with the base frame marginalised."""
         if not len(self.x0.T_G_M):
             return self
         x0 = dataclasses.replace(self.x0, T_G_M=np.zeros((0, 7)))
         return self._without(self._base_columns + np.arange(6), x0, self.is_fixed)
 
     def without_frame(self, frame: int) -> WindowPrior:
-        """Return the prior of all other frames: what it says of this frame is marginalised."""
+        """Return the prior of all other frames, with this frame marginalised."""
         columns = FRAME_SIZE * frame + np.arange(FRAME_SIZE)
         is_fixed = np.delete(self.is_fixed, frame)
         return self._without(columns, self.x0.without_frame(frame), is_fixed)

@@ -67,7 +67,7 @@ class WindowProblem:
         self._latest: WindowLinearization | None = None
 
     def relinearize(self, states: WindowStates) -> bool:
-        """Integrate edges again whose biases have moved far; tell whether there were any."""
+        """Integrate edges again whose biases have changed much; return whether there were any."""
         return self._factors.chain.relinearize(states.motion)
 
     def linearize(self, states: WindowStates, damping: float) -> WindowLinearization:

@@ -1,4 +1,4 @@
-"""The fixed-lag smoother: frames come in, states come out.
+"""The fixed-lag smoother of tracked frames and inertial samples.
 
 Source of the frame policy: Leutenegger et al., Keyframe-based Visual-Inertial Odometry Using Nonlinear
 Optimization, IJRR 2015, section 4.2; of the marginal prior: Usenko et al., Visual-Inertial Mapping with
@@ -213,7 +213,7 @@ class FixedLagSmoother:
         return self.problem()[0].calibration_sigma(self._states)
 
     def problem(self) -> tuple[WindowProblem, WindowStates]:
-        """Return the least-squares problem of the window as it is now, and its states."""
+        """Return the current least-squares problem of the window, and its states."""
         return self._problem(self.tracks.landmark_rows, self._map_terms())[0], self._states
 
     # -- a new frame ------------------------------------------------------------------------------

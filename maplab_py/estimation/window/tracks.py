@@ -132,7 +132,7 @@ class Tracks:
         return order[: start[-1]], start
 
     def data(self, rows: I64, huber_sigmas: float) -> tuple[WindowData, I64]:
-        """Return what kernels read of some tracks (R,), and which observations (O',) these are."""
+        """Return the kernels' arguments of some tracks (R,), and the rows (O',) of their observations."""
         order, start = self.grouped(rows)
         seen = self.observations
         data = WindowData(

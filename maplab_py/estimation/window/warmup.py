@@ -25,7 +25,7 @@ from maplab_py.sensors import Camera, Distortion, Imu, Projection
 
 
 def window_jobs() -> dict[str, Callable[[], None]]:
-    """Return by name what compiles one kernel each."""
+    """Return functions by name, each of which compiles a kernel."""
     jobs: dict[str, Callable[[], None]] = {"window": _run_frames}
     jobs["window landmarks"] = _run_landmarks
     return jobs
