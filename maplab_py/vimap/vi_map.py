@@ -157,7 +157,7 @@ class VIMap:
     resources: Resources = dataclasses.field(default_factory=Resources.empty)
 
     def __repr__(self) -> str:
-        """Say in one line what the map holds."""
+        """Return the content of the map in one line."""
         numbers = self._contents()
         nouns = ("mission", "vertex", "landmark", "keypoint", "closure")
         pairs = zip(numbers.values(), nouns, numbers, strict=True)

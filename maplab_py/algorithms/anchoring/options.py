@@ -69,7 +69,7 @@ class AnchoringReport(Report):
 
     @property
     def failure(self) -> str:
-        """Say which missions stay unknown."""
+        """Return a line on missions whose base frames remain unknown."""
         if self.reason:
             return self.reason
         if not self.not_anchored:

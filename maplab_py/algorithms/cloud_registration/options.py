@@ -88,7 +88,7 @@ class CloudClosureReport(Report):
 
     @property
     def advice(self) -> str:
-        """Tell how the edges take effect."""
+        """Return how the edges take effect."""
         if self.edges_added:
             return "relax, or optvi --ba_include_loop_closure_edges, uses the edges"
         return "" if not self.pairs else "lc_report --which=refused shows all candidates"

@@ -181,7 +181,7 @@ class LocalizationEvaluationReport(Report):
 
     @property
     def failure(self) -> str:
-        """Say that nothing was localised."""
+        """Return the failure if nothing was localised."""
         if any(errors.localized_share > 0.0 for errors in self.files):
             return ""
         return "no frame with ground truth was localised"

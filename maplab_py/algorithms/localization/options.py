@@ -81,7 +81,7 @@ class LocalizationReport(Report):
 
     @property
     def failure(self) -> str:
-        """Say that nothing was localised."""
+        """Return the failure if nothing was localised."""
         if self.localized:
             return ""
         reasons = ", ".join(f"{why}: {count}" for why, count in self.refused.items())

@@ -94,7 +94,7 @@ def listed_alignments(contests: Sequence[Contest]) -> list[tuple[int, int]]:
 
 
 def with_choice(contests: Sequence[Contest], choice: AlignmentChoice) -> list[Contest]:
-    """Let the alignment win that a person has chosen.
+    """Accept the alignment that a person has chosen.
 
     Raises:
         UserError: There is no such alignment.

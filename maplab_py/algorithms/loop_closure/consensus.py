@@ -87,7 +87,7 @@ class _Compared:
     is_other: Mask  # of another query vertex
 
     def votes(self, inliers: I64, alive: Mask, max_difference: float) -> tuple[I64, F64, Mask]:
-        """Return support by distinct query vertices, differences, and which closures nobody judges.
+        """Return support by distinct query vertices, differences, and closures that no other one tests.
 
         The difference of a closure is the smallest one beyond which the inliers that contradict it are
         not more than its own and those that agree.

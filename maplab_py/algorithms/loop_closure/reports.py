@@ -77,7 +77,7 @@ class LoopClosureReport(Report):
 
     @property
     def advice(self) -> str:
-        """Tell how to get more closures, or what to do with those that were accepted."""
+        """Return how to get more closures, or how to use the accepted ones."""
         drifted = self.refused.get(Verdict.IMPLAUSIBLE.value, 0)
         if self.candidates and drifted > self.accepted:
             return f"{drifted} closures correct more than the drift allows: relax first"

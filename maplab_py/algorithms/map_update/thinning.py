@@ -45,7 +45,7 @@ _DRIFT, _SIGMA_M, _SIGMA_RAD = 0.01, 0.01, 0.005
 
 @dataclasses.dataclass(frozen=True)
 class Thinned:
-    """Numbers of what was removed."""
+    """Numbers of removed entities."""
 
     landmarks_vanished: int
     landmarks_thinned: int

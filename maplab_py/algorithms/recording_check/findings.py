@@ -114,18 +114,18 @@ class RecordingCheck(Report):
 
     @property
     def cause(self) -> Finding | None:
-        """The finding to mend first."""
+        """The finding to repair first."""
         return cause(self.findings)
 
     @property
     def failure(self) -> str:
-        """Say why no map can be made of the recording; empty if nothing speaks against it."""
+        """Return why no map can be made of the recording; empty if one can."""
         first = self.cause
         return first.line if first is not None and first.verdict is Verdict.HOPELESS else ""
 
     @property
     def advice(self) -> str:
-        """Say what to mend first."""
+        """Return the remedy to apply first."""
         first = self.cause
         if first is None:
             return f"rovioli {self.recording} --save_map_folder=FOLDER makes a map of it"

@@ -81,7 +81,7 @@ class CameraSampler:
         self._last_time_ns = 0
 
     def is_due(self, time_ns: int) -> bool:
-        """Tell whether an image is far enough from the one before."""
+        """Return whether an image is far enough from the one before."""
         return not self._last_time_ns or time_ns - self._last_time_ns >= _SHORTEST_S * 1e9
 
     def add(self, time_ns: int, grey: U8) -> None:

@@ -112,7 +112,7 @@ def check_accel_axes(
 
 
 def raw_axes_agree(signals: Signals, accel: F64, camera: rates.CameraTurns) -> bool | None:
-    """Tell whether the accelerometer agrees with the gyroscope's axes as recorded better than as exchanged.
+    """Return whether the accelerometer agrees with the gyroscope's axes as recorded better than as exchanged.
 
     Returns:
         None if the recording does not show it.

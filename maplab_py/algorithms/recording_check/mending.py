@@ -65,7 +65,7 @@ class MendedRecording(RecalibratedRecording):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Notes of the reader, and what is mended."""
+        """Notes of the reader, and corrections."""
         note = (
             f"does not fit its calibration; read with what check_recording finds: {', '.join(self.words)} "
             "(--vio_apply_calibration=false does not do so)"

@@ -37,7 +37,7 @@ def check_times(signals: Signals, stream: StreamOptions, *, is_whole: bool) -> I
 
 
 def cannot_work(signals: Signals, *, is_whole: bool) -> bool:
-    """Tell whether samples or images are missing, or have no time in common."""
+    """Return whether samples or images are missing, or have no time in common."""
     return _check_spans(signals, is_whole).verdict is Verdict.HOPELESS
 
 

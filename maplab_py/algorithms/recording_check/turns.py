@@ -205,7 +205,7 @@ class GyroTurns:
         self._sum = np.concatenate([np.zeros((1, 3)), np.cumsum(mean * step, axis=0)])
 
     def covers(self, first_ns: I64, second_ns: I64, delay_s: float) -> Mask:
-        """Tell which intervals (P,) have samples when they are later by a delay."""
+        """Return which intervals (P,) have samples when they are later by a delay."""
         first, second = (self._seconds(t) + delay_s for t in (first_ns, second_ns))
         return np.asarray((first >= 0.0) & (second <= self._times_s[-1]))
 

@@ -30,7 +30,7 @@ _STEP_NS = 1_000_000_000
 
 
 def is_odometry(graph: PoseGraph) -> Mask:
-    """Tell which edges (E,) join a pose with the next one of the same robot; first of each pair.
+    """Return which edges (E,) join a pose with the next one of the same robot; first of each pair.
 
     The next pose is that of the next id in the file: ids may have gaps, and edges may point backwards.
     """

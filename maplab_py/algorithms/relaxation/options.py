@@ -76,7 +76,7 @@ class RelaxationReport(Report):
 
     @property
     def failure(self) -> str:
-        """Say that nothing was relaxed, and why."""
+        """Return why nothing was relaxed."""
         if self.num_loop_closures > 0:
             return ""
         return "no loop closure edges" + "".join(f"; {note}" for note in self.notes)

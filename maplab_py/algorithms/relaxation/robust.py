@@ -342,7 +342,7 @@ def largest_error(count: int) -> float:
 
 
 def with_tail(u: F64, limit: float) -> Mask:
-    """Tell which closures (E,) agree, if the errors of those which do have a longer tail.
+    """Return which closures (E,) agree, if the errors of those which do have a longer tail.
 
     Up from the limit, those are added which follow closely upon one another. When they are too many
     for a tail there is no gap between true and false ones, and the limit itself decides.

@@ -128,7 +128,7 @@ def with_calibration_file(
 def _complete(
     sensors: SensorSet, device: Device, calibration: CalibrationFile
 ) -> tuple[SensorSet, Device]:
-    """Return the rig of a file beside an IMU, with image delays instead of time offsets."""
+    """Return the rig of a file with an IMU, with image delays instead of time offsets."""
     rig, map_rig = (
         calibration.sensors.camera_rig(calibration.rig_id),
         sensors.camera_rig(device.rig),

@@ -45,7 +45,7 @@ class SelfCalibrationReport(Report):
 
     @property
     def advice(self) -> str:
-        """Tell how to confirm a doubtful change, or what uses the calibration."""
+        """Return how to confirm a doubtful change, or how to use the calibration."""
         if any(row.verdict.startswith("not confirmed") for row in self.parameters):
             return "changes are not confirmed: self_calibrate --parts=4, or record a longer session"
         if any("disagree" in row.verdict for row in self.parameters):

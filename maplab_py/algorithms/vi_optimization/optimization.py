@@ -66,7 +66,7 @@ def optimize(
 
 
 def contradicted_calibration(vi_map: VIMap, progress: Progress = SILENT) -> bool:
-    """Tell whether the residuals of a map contradict its calibration, before it has been optimised.
+    """Return whether the residuals of a map contradict its calibration, before it has been optimised.
 
     After a few iterations the gains of a free calibration are about those at the optimum.
     """

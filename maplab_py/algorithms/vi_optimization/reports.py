@@ -82,7 +82,7 @@ class VIOptimizationReport(Report):
 
     @property
     def advice(self) -> str:
-        """Tell whether more iterations are worth while, or which landmarks are missing."""
+        """Return whether more iterations are worth while, or which landmarks are missing."""
         if self.landmarks == 0 and self.observations == 0:
             return "no landmarks were used: init_track_landmarks makes them from feature tracks"
         if self.termination != "iteration limit":

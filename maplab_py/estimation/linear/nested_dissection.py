@@ -22,7 +22,7 @@ _LEFT, _RIGHT, _CUT = 0, 1, 2
 
 
 def has_metis() -> bool:
-    """Tell whether the optional package pymetis is installed."""
+    """Return whether the optional package pymetis is installed."""
     return importlib.util.find_spec("pymetis") is not None
 
 

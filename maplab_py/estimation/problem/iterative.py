@@ -268,7 +268,7 @@ class IterativeProblem(Problem):
     # -- the direct solver -------------------------------------------------------------------------
 
     def _return_to_direct(self) -> None:
-        """Let the direct solver take over; where it does not fit, go on with truncated steps."""
+        """Switch to the direct solver; where it does not fit, continue with truncated steps."""
         self._overruns = 0
         if self._is_direct_refused:
             return

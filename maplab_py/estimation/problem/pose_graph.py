@@ -132,7 +132,7 @@ class PoseGraphProblem:
         return other
 
     def set_active(self, closures: Mask) -> None:
-        """Let only some closures (L,) count."""
+        """Use only some closures (L,)."""
         self._linear = None
         self._weights.is_active[self._weights.first_robust :] = closures
 
@@ -217,7 +217,7 @@ class PoseGraphProblem:
             self._diagonal[:] = undamped
 
     def is_stationary(self, linear: PoseLinearization, tolerance: float) -> bool:
-        """Tell whether no entry of the gradient is above a tolerance."""
+        """Return whether no entry of the gradient is above a tolerance."""
         return bool(np.abs(linear.system.gradient).max(initial=0.0) <= tolerance)
 
     def norm(self, states: F64) -> float:

@@ -122,7 +122,7 @@ def _ends(nodes: I64, num_vertices: int) -> tuple[I64, I64]:
 
 
 def _joins_parts(low: I64, high: I64, num_vertices: int) -> Mask:
-    """Tell which factors (N,) are edges of a spanning forest in which near ones come first.
+    """Return which factors (N,) are edges of a spanning forest in which near ones come first.
 
     The others close a loop. A forest adds no fill.
     """

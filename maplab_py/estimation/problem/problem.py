@@ -20,7 +20,7 @@ from maplab_py.estimation.terms.visual import VisualTerms
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Linearization:
-    """The normal equations at some states, and what is needed to judge a step.
+    """The normal equations at some states, and the data to evaluate a step.
 
     The matrix itself is in the storage of the linear solver, whose factor replaces it.
     """
@@ -108,7 +108,7 @@ class Problem:
         return np.concatenate(rows), np.concatenate(cols)
 
     def restrict(self, nodes: I64, projectors: F64) -> None:
-        """Let nodes (k,) move only in the range of projectors (k, 3, 3); fixed ones stay fixed."""
+        """Restrict steps of nodes (k,) to the range of projectors (k, 3, 3); fixed nodes stay fixed."""
         is_fixed = ~self._projector[nodes].any(axis=(1, 2), keepdims=True)
         self._projector[nodes] = np.where(is_fixed, 0.0, projectors)
         self._restricted[nodes] = True
@@ -221,7 +221,7 @@ class Problem:
         return Step(moved, costs, promised, states.step_size(step, moved))
 
     def is_stationary(self, linear: Linearization, tolerance: float) -> bool:
-        """Tell whether no entry of the gradient is above a tolerance; landmarks must not move."""
+        """Return whether no entry of the gradient is above a tolerance; landmarks must not move."""
         if self.visual is not None and self.visual.moves_points:
             return False  # their gradient is not known
         return bool(np.abs(self.projected_gradient(linear)).max(initial=0.0) <= tolerance)

@@ -55,7 +55,7 @@ class LeastSquares(Protocol[S, L]):
         """
 
     def is_stationary(self, linear: L, tolerance: float) -> bool:
-        """Tell whether the whole gradient is known and no entry is larger than the tolerance."""
+        """Return whether the whole gradient is known and no entry is larger than the tolerance."""
 
     def norm(self, states: S) -> float:
         """Return the norm of all values, for the relative size of a step."""

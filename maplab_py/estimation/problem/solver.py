@@ -93,7 +93,7 @@ class _Run(Generic[S, L]):
         return abs(self.cost - new_cost) <= self.options.function_tolerance * self.cost
 
     def would_stop(self, step: Step[S]) -> bool:
-        """Tell whether a step ends the run: one of an iterative solver must then be exact."""
+        """Return whether a step ends the run: one of an iterative solver must then be exact."""
         return self.is_small(step.norm) or self.has_converged(step.cost)
 
     def is_stationary(self) -> bool:

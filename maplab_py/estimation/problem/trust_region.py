@@ -144,6 +144,6 @@ class Decreases:
         return self._last * self.ratio / (1.0 - self.ratio)
 
     def is_slow(self, cost: float, slow_ratio: float) -> bool:
-        """Tell whether decreases that are small against the cost shrink by no more than a ratio."""
+        """Return whether decreases that are small against the cost shrink by no more than a ratio."""
         is_near = 0.0 < self._last < _NEAR * cost
         return is_near and self._previous > 0.0 and self.ratio > slow_ratio

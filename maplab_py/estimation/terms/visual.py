@@ -103,7 +103,7 @@ class VisualTerms:
         estimate_line_delays: bool = False,
         landmark_prior: F64 | None = None,
     ) -> None:
-        """Analyse who sees what together.
+        """Analyse the covisibility of vertices.
 
         Args:
             kernels: Those of `visual_kernels`.
@@ -140,7 +140,7 @@ class VisualTerms:
         return visual_structure.elimination_plan(data.start, data.vertex, self.num_vertices)
 
     def forget_plan(self) -> None:
-        """Give back the memory of the plan, which is made again when somebody needs it."""
+        """Free the memory of the plan, which is made again on demand."""
         self.__dict__.pop("plan", None)
 
     @cached_property
@@ -169,7 +169,7 @@ class VisualTerms:
         self.observations = observations
 
     def follow_motion(self, motion: VertexMotion, known_delay_s: F64 | None = None) -> None:
-        """Let pixels be of other times than their vertices.
+        """Give pixels other times than those of their vertices.
 
         The velocities of pixels are those halfway between vertex and pixel, at the states of the latest
         `refresh`: times the delay that is a displacement to second order. Known delays only move the

@@ -30,7 +30,7 @@ class AlignmentLinearization:
 
 
 class AlignmentProblem:
-    """Observations of a map, and what was known of T_G_M before; see `problem.protocol.LeastSquares`."""
+    """Observations of a map, and a prior on T_G_M; see `problem.protocol.LeastSquares`."""
 
     def __init__(self, terms: MapTerms, T_G_M: F64, sigma: F64) -> None:
         """Take observations of landmarks that are exact, and a prior (7,) with deviations (6,)."""
@@ -75,7 +75,7 @@ class AlignmentProblem:
         return Step(moved, costs, promised, float(np.linalg.norm(step)))
 
     def is_stationary(self, linear: AlignmentLinearization, tolerance: float) -> bool:
-        """Tell whether no entry of the gradient is above a tolerance."""
+        """Return whether no entry of the gradient is above a tolerance."""
         return bool(np.abs(linear.gradient).max() <= tolerance)
 
     def norm(self, states: WindowStates) -> float:

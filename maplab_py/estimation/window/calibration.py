@@ -193,7 +193,7 @@ class WindowCalibration:
         return so3.rotate(so3.inverse(q_I_C), so3.rotate(turn, so3.rotate(q_I_C, rays_C)))
 
     def units(self) -> list[tuple[float, str]]:
-        """Return by what each of the states (K) is multiplied to be shown, and its unit."""
+        """Return the factor by which each of the states (K) is displayed, and its unit."""
         return [_unit_of(name) for name in self.names()]
 
     def names(self) -> list[str]:
@@ -212,7 +212,7 @@ class WindowCalibration:
 
 
 def _unit_of(name: str) -> tuple[float, str]:
-    """Return by what a number is multiplied to be shown, and its unit."""
+    """Return the factor by which a number is displayed, and its unit."""
     for word, unit in _UNITS.items():
         if word in name:
             return unit

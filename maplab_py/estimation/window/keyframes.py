@@ -11,7 +11,7 @@ from maplab_py.estimation.window.tracks import Tracks
 def needs_keyframe(
     tracks: Tracks, T_M_I: F64, T_I_C: F64, keyframe: int, options: WindowOptions
 ) -> bool:
-    """Tell whether the newest frame has parallax to the last keyframe, or few of its tracks.
+    """Return whether the newest frame has parallax to the last keyframe, or few of its tracks.
 
     Parallax is the median angle between the rays of the same tracks in M, so that turning gives none.
 

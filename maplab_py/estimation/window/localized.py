@@ -97,7 +97,7 @@ class LocalizedSmoother(smoother.FixedLagSmoother):
         self._pose = None
 
     def associate(self, matches: map_tracks.MapMatches) -> int:
-        """Let whole tracks observe landmarks of the map from the next update on; return how many did.
+        """Associate whole tracks with landmarks of the map from the next update on; return their number.
 
         A track stops being a landmark of the odometry: none of its keypoints enters twice.
 
@@ -113,7 +113,7 @@ class LocalizedSmoother(smoother.FixedLagSmoother):
     # -- what the smoother asks for ---------------------------------------------------------------
 
     def _gate_new(self) -> None:
-        """Give back, too, tracks whose newest observation is far from their landmark of the map."""
+        """Drop associations whose newest observation is far from the landmark of the map, too."""
         super()._gate_new()
         if not self.is_localized:
             return
@@ -139,7 +139,7 @@ class LocalizedSmoother(smoother.FixedLagSmoother):
         return self._terms(None, self.rule.tilt_sigma_rad)
 
     def _leaving_map_terms(self) -> MapTerms | None:
-        """Return what the first frame and the ended tracks that begin in it say about the map.
+        """Return the map terms of the first frame and of ended tracks that begin in it.
 
         Landmarks that are estimated leave with all their observations, and only when their track has
         ended; exact ones leave observation by observation.

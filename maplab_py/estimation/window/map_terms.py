@@ -84,7 +84,7 @@ class MapTerms:
         huber_sigmas: float,
         tilt_sigma_rad: float = np.inf,
     ) -> None:
-        """Join what was observed.
+        """Join the observations.
 
         Args:
             observations: Observations of the map's landmarks.
@@ -286,7 +286,7 @@ with it, and landmarks of the map have errors of their own.
 
 
 def contradicted(error_px: F64, seen: MapObservations, options: WindowOptions) -> Mask:
-    """Tell which landmarks (A,) have an observation far from where it is expected.
+    """Return which landmarks (A,) have an observation far from where it is expected.
 
     Args:
         error_px: Reprojection errors (O,) at predicted poses; infinite where a landmark is not visible.
@@ -303,7 +303,7 @@ def contradicted(error_px: F64, seen: MapObservations, options: WindowOptions) -
 def contradicted_unless_most(
     error_px: F64, seen: MapObservations, options: WindowOptions, *, frame: int | None = None
 ) -> Mask:
-    """Tell what `contradicted` does; when most landmarks are, the prediction is wrong and none is.
+    """Return `contradicted`, or none where most landmarks are, since then the prediction is wrong.
 
     Args:
         error_px: Reprojection errors (O,), see `contradicted`.

@@ -52,7 +52,7 @@ class MapTracks:
         return len(self.matches)
 
     def includes(self, track_id: I64) -> Mask:
-        """Tell which tracks (N,) are associated."""
+        """Return which tracks (N,) are associated."""
         return np.isin(track_id, self.matches.track_id)
 
     def add(self, matches: MapMatches, tracks: Tracks) -> int:
@@ -75,7 +75,7 @@ class MapTracks:
         self._refused = self._refused[np.isin(self._refused, tracks.id)]
 
     def refuse(self, rows: I64) -> None:
-        """Remove associations (rows) that contradict what is observed."""
+        """Remove associations (rows) that the observations contradict."""
         self._refused = np.append(self._refused, self.matches.track_id[rows])
         kept: Mask = np.ones(len(self), dtype=np.bool_)
         kept[rows] = False

@@ -47,7 +47,7 @@ def marginalized(
 
 
 def _factors_of(frame: int | None) -> Part:
-    """Return what is known of a frame, and the edges that meet in it."""
+    """Return the factors of a frame, and its edges."""
     if frame is None:
         return Part(slice(0, 0), slice(0, 0))
     return Part(slice(max(frame - 1, 0), frame + 1), slice(frame, frame + 1))

@@ -24,7 +24,7 @@ _LANDMARK_DAMPING, _NEARLY_UNDAMPED = 1e-12, 1e-4
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class WindowLinearization:
-    """Normal equations at some states, and what is needed to step the landmarks."""
+    """Normal equations at some states, and the data for steps of landmarks."""
 
     system: window_arguments.DenseSystem
     kept: window_arguments.Elimination
@@ -48,7 +48,7 @@ class WindowProblem:
         map_terms: MapTerms | None = None,
         times: FrameTimes | None = None,
     ) -> None:
-        """Join what was measured.
+        """Join the measurements.
 
         Args:
             kernels: Compiled from the template `window` for the cameras' models.
@@ -109,7 +109,7 @@ class WindowProblem:
         return Step(moved, costs, promised, float(np.sqrt(norm2 + np.vdot(step, step))))
 
     def is_stationary(self, linear: WindowLinearization, tolerance: float) -> bool:
-        """Tell whether no entry of the gradient is above a tolerance."""
+        """Return whether no entry of the gradient is above a tolerance."""
         gradients = (linear.system.gradient, linear.kept.gradient)
         return all(np.abs(g).max(initial=0.0) <= tolerance for g in gradients)
 

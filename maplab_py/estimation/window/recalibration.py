@@ -74,7 +74,7 @@ class WindowChange:
         return se3.compose(newest, se3.inverse(se3.compose(newest, self.T_old_new)))
 
     def _bias(self, row: int, bias: F64, mean: F64) -> F64:
-        """Return biases (F, 3) by which the mean sample means what it has meant before."""
+        """Return biases (F, 3) that keep the corrected mean sample."""
         old, new = (correction[row] for correction in self.correction)
         return np.asarray(mean - np.linalg.solve(new, old @ (mean - bias).T).T)
 

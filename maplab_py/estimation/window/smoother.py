@@ -246,7 +246,7 @@ class FixedLagSmoother:
         return frame
 
     def _may_replace(self, frame: WindowFrame) -> bool:
-        """Tell whether the latest frame rests, too, and the joined interval is not too long."""
+        """Return whether the latest frame rests, too, and the joined interval is not too long."""
         if len(self._states) < 2 or not self._chain.is_resting[-1] or self._frames.is_keyframe[-1]:
             return False
         return (frame.time_ns - int(self._frames.time_ns[-2])) * 1e-9 <= self.options.max_joined_s
@@ -378,7 +378,7 @@ class FixedLagSmoother:
     # -- what a localised smoother adds -----------------------------------------------------------
 
     def _may_be_landmark(self) -> Mask | bool:
-        """Tell which tracks (T,) may become landmarks of the odometry."""
+        """Return which tracks (T,) may become landmarks of the odometry."""
         return True
 
     def _map_terms(self) -> MapTerms | None:
@@ -398,7 +398,7 @@ class FixedLagSmoother:
     # -- frames leave -----------------------------------------------------------------------------
 
     def _decide(self, motion: Motion) -> bool:
-        """Tell whether the newest frame becomes a keyframe."""
+        """Return whether the newest frame becomes a keyframe."""
         if motion is Motion.RESTING:
             return False
         last = int(np.flatnonzero(self._frames.is_keyframe)[-1])

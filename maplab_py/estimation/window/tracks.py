@@ -73,7 +73,7 @@ class Tracks:
         self.observations = Observations.concatenate([self.observations, new])
 
     def replace_rays(self, ray_C: F64) -> None:
-        """Take other rays (O, 3) of the observations; landmarks move with those of their anchors."""
+        """Replace the rays (O, 3) of the observations; landmarks move with those of their anchors."""
         seen = self.observations
         is_anchor = seen.frame == self.anchor_frame[seen.row]
         is_anchor &= seen.camera == self.anchor_camera[seen.row]
@@ -86,7 +86,7 @@ class Tracks:
         return np.bincount(self.observations.row, minlength=len(self))
 
     def candidates(self, is_allowed: Mask | bool, length: int | None) -> I64:
-        """Return allowed tracks (rows) that may become landmarks: those that go on first, long ones first.
+        """Return allowed tracks (rows) that may become landmarks: continuing ones first, then by length.
 
         Without them the newest frames would hang on samples alone.
 
@@ -103,7 +103,7 @@ class Tracks:
 
     @property
     def is_active(self) -> Mask:
-        """Tell which tracks (T,) the newest frame observes."""
+        """Return which tracks (T,) the newest frame observes."""
         return np.asarray(self.last_seen == self._clock)
 
     @property
@@ -119,7 +119,7 @@ class Tracks:
         return np.bincount(rows, minlength=len(self))
 
     def is_seen_by(self, frame: int) -> Mask:
-        """Tell which tracks (T,) a frame observes."""
+        """Return which tracks (T,) a frame observes."""
         seen: Mask = np.zeros(len(self), dtype=np.bool_)
         seen[self.observations.row[self.observations.frame == frame]] = True
         return seen
@@ -202,7 +202,7 @@ class Tracks:
         self.make_landmarks(rows[kept], p_M[kept], poses)
 
     def make_persistent(self, wanted: int) -> None:
-        """Let the landmarks seen most that are still tracked stay, until there are as many as wanted."""
+        """Make the most observed landmarks that are still tracked persistent, up to the wanted number."""
         may_stay = self.is_landmark & self.is_active
         self.is_persistent &= may_stay
         others = np.flatnonzero(may_stay & ~self.is_persistent)

@@ -79,7 +79,7 @@ class Triangulator:
         return np.degrees(result)
 
     def _is_good(self, tracks: Tracks, rows: I64, at: WindowPoint) -> Mask:
-        """Tell which landmarks (R,) have depths and errors within their limits."""
+        """Return which landmarks (R,) have depths and errors within their limits."""
         options = self._options
         data, _ = tracks.data(rows, options.huber_sigmas)
         error_depth = np.empty((len(data.frame), 2))

@@ -24,7 +24,7 @@ def shows_parallax(
     T_I_C: F64,
     back_projection: BackProjection,
 ) -> bool:
-    """Tell whether a new frame shows parallax to a frame of half a second before.
+    """Return whether a new frame shows parallax to a frame of half a second before.
 
     From one image to the next, slow motion cannot be told from turning only.
 
@@ -61,7 +61,7 @@ def shows_parallax(
 def is_on_the_spot(
     frame: WindowFrame, motion: F64, covariance: F64, options: WindowOptions
 ) -> tuple[bool, bool]:
-    """Tell whether a frame turns on the spot, and whether that is sure: at a speed well known to be zero.
+    """Return whether a frame turns on the spot, and whether that is sure: at a speed well known to be zero.
 
     Args:
         frame: The frame, with the samples that lead to it.

@@ -192,7 +192,7 @@ _SECONDS_BETWEEN_TRIES, _SECONDS_TO_WAIT = 0.1, 600.0
 
 @contextlib.contextmanager
 def locked_database(path: Path | None) -> Iterator[None]:
-    """Hold a database from reading to writing it, so that nobody's segments are lost; None = nothing.
+    """Lock a database from reading to writing it, so that no process loses segments; None = nothing.
 
     Raises:
         UserError: Another process holds it for minutes, or its folder cannot be written.
