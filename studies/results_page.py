@@ -19,22 +19,23 @@ from studies.thesis_tables import (
 )
 
 _ANSWER = (
-    "For the selection of segments yes: with eight informative ones odometry is as good as with all data, "
-    "with random ones\n2 to 8 times worse. The joint filter does worse than in the thesis."
+    "For the selection of segments yes: with eight informative ones errors of odometry are those with all "
+    "data, with random ones\n2 to 8 times as large. The joint filter is less accurate than in the thesis."
 )
-_LIMITS = "So few tell a deviation to a half. Run times are of another processor."
+_LIMITS = "Deviations over so few are uncertain by half. Run times are of another processor."
 _SHOWS = {
-    "6.1": "Informative segments vary hardly more than all data (thesis: twice as much). Information gain "
-    "stops at the first eight\nabove its threshold, and is far worse here.",
-    "6.2": "Groups gain nothing here, although they keep 11 segments for 8.",
+    "6.1": "Informative segments scatter hardly more than all data (thesis: twice as much). Information gain "
+    "stops at the first eight\nabove its threshold, and scatters far more.",
+    "6.2": "Groups gain nothing here, although they keep 11 segments instead of 8.",
     "6.3": "Information gain takes nearly four times as long as scores of single segments "
     "(thesis: 13 times).",
     "7.1": "The same as in the thesis, by number of dimensions:",
-    "7.2": "Our office building is straight corridors with few turns, in which selection matters most.",
+    "7.2": "The simulated office building has straight corridors with few turns, where selection matters "
+    "most.",
     "7.3": "Selected segments do as well as all data by every criterion, as in the thesis; random ones are "
-    "worse, most where little\nof a session excites. The filter diverges in four of nine sessions, which "
+    "worse, most in sessions\nwith little excitation. The filter diverges in four of nine sessions, which "
     "begin at rest or on the spot.",
-    "7.4": "Eight segments vary hardly more than all data (thesis: 2 to 40 times).",
+    "7.4": "Eight segments scatter hardly more than all data (thesis: 2 to 40 times).",
     "7.5": "Calibrating on eight segments takes a quarter of the time of all data (thesis: 0.45).",
 }
 """Sentence on every table."""
