@@ -1,4 +1,4 @@
-"""Maps that live: recall, size and time over a year of sessions in a place that changes.
+"""Living maps: recall, size and time over a year of sessions in a place that changes.
 
 python -m benchmarks.living_maps [SEED ...] [--sessions=30] [--results=FILE]
 
