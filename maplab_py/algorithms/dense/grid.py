@@ -105,7 +105,7 @@ class TsdfGrid:
 
         Args:
             depth: Depths along the optical axis, 0 = unknown.
-            T_G_C: Its pose.
+            T_G_C: Pose of the camera.
             with_free_space: Also make the blocks between the camera and the surface.
 
         Raises:

@@ -193,9 +193,8 @@ class PoseGraphProblem:
         downhill = -float(np.vdot(gradient, twist))
         curvature, share = downhill - float(np.vdot(twist, added * twist)), 1.0
         moved, cost = self._moved(states, twist)
-        if (
-            linear.cost < cost < np.inf
-        ):  # then to the least of a parabola, as factorisations cost more
+        if linear.cost < cost < np.inf:
+            # a shorter step, to the minimum of a parabola, takes less time than another factorisation
             share = 0.5 * downhill / (cost - linear.cost + downhill)
             twist *= share
             moved, cost = self._moved(states, twist)

@@ -434,7 +434,7 @@ def image_data(
     """Return the image of a serialised message.
 
     Args:
-        kind: Its type, one of `IMAGE_TYPES`.
+        kind: Type of the message, one of `IMAGE_TYPES`.
         name: What messages call it.
         store: Definitions of messages.
         is_ros_2: CDR, else ROS 1.
