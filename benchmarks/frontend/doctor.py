@@ -18,7 +18,6 @@ from maplab_py.algorithms.recording_check.correction import correct
 from maplab_py.algorithms.recording_check.doctor import diagnose, first_cause
 from maplab_py.frontend.data_source import open_source
 from maplab_py.frontend.run_options import DataSourceOptions
-from maplab_py.interop.device import RecordedSensors
 from maplab_py.interop.recordings.options import SourceOptions
 from maplab_py.interop.recordings.protocol import Recording
 from maplab_py.interop.recordings.reader_choice import open_recording
@@ -135,7 +134,7 @@ def _walk(shared: Path) -> Recording:
             imu_calibration_file=folder / "imu.yaml",
         ),
     )
-    device: RecordedSensors = correct(diagnose(opened)).device
+    device, _ = correct(diagnose(opened))
     offset_ns = device.cameras[0].time_offset_ns
     return dataclasses.replace(faults.sound(opened), device=device, imu_shift_ns=-offset_ns)
 

@@ -9,7 +9,7 @@ import pytest
 from maplab_py.array_types import F64
 from maplab_py.errors import UserError
 from maplab_py.estimation.window.frame import Motion
-from maplab_py.frontend.odometry_update import OdometryStatus, OdometryUpdate
+from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.frontend.vertex_keypoints import VertexKeypoints, described_frames
 from maplab_py.vimap.descriptors import DescriptorDepth, FeatureType
 from maplab_py.vision.features.learned.checkpoint import Arrays
@@ -155,9 +155,7 @@ def test_a_thread_describes_every_third_vertex(
     uv_px = np.array([[60.0, 40.5], [70.25, 50.0]])
     tracks = CameraTracks(uv_px, ids, np.ones(2), np.full(2, 12.0), ids)
     tracked = TrackedImages(0, (tracks,), 0.0, False, {}, "brisk")
-    update = OdometryUpdate(
-        5, OdometryStatus.TRACKING, 0, tracked, Motion.MOVING, None, {}, images=(image,)
-    )
+    update = OdometryUpdate(5, 0, tracked, Motion.MOVING, None, {}, images=(image,))
     keypoints = VertexKeypoints("xfeat", 3)
     frames = [keypoints.of(update) for _ in range(60)]
     assert all(isinstance(each, Future) for each in frames)
