@@ -45,7 +45,6 @@ class KernelHook(BuildHookInterface):  # type: ignore[type-arg]
         environment = {
             **{name: value for name, value in os.environ.items() if name != "MAPLAB_NATIVE"},
             "MAPLAB_CACHE_DIR": self._compiled.name,
-            "PYTHONDONTWRITEBYTECODE": "1",
             "PYTHONPATH": os.pathsep.join(filter(None, paths)),
         }
         for processor in processors.split(","):
