@@ -32,7 +32,8 @@ def straight_line(function: Callable[..., None], width: int = 1, *, contracts: b
         function: Assigns sums, products, functions of `math` and choices between two values, of real
             arguments and entries, also of rows, to names and to entries. Indices are sums and products
             of constants, integers among the arguments and variables of loops over `range(CONSTANT)`. It
-            has no other statements.
+            has no other statements. A row that has a name is not written while the name is in use:
+            without compilation (NUMBA_DISABLE_JIT=1) the name would change with it.
         width: Length of the last axis of arrays that are indexed by one index less than they have axes,
             and number of arguments of `row`. Sums and products of rows, and of rows and numbers, are rows.
         contracts: Whether a product and a sum may be one operation, which is rounded once.

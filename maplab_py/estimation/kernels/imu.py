@@ -209,7 +209,12 @@ def _transition(state: F64, E: F64, M: F64, dt: float) -> None:
         b = M[1, i, 0] * x + M[1, i, 1] * y + M[1, i, 2] * z
         state[i] = state[i] + dt * (state[6 + i] + 0.5 * dt * b)
         state[6 + i] = state[6 + i] + dt * a
-        state[3 + i] = E[0, i] * x + E[1, i] * y + E[2, i] * z
+    turned_x = E[0, 0] * x + E[1, 0] * y + E[2, 0] * z
+    turned_y = E[0, 1] * x + E[1, 1] * y + E[2, 1] * z
+    turned_z = E[0, 2] * x + E[1, 2] * y + E[2, 2] * z
+    state[3] = turned_x
+    state[4] = turned_y
+    state[5] = turned_z
 
 
 _move_covariance = straight_line(_transition, width=12, contracts=False)

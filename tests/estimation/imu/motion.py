@@ -46,5 +46,4 @@ def sampled(seconds: float, rate_hz: float) -> tuple[NDArray[np.int64], F64]:
 
 def one_edge(stamps: NDArray[np.int64], readings: F64, imu: Imu | None = None) -> InertialData:
     """Make an edge of all samples."""
-    start = np.array([0, len(stamps)])
-    return InertialData(start, stamps, readings, (imu or Imu("0" * 32),), np.zeros(1, np.int64))
+    return InertialData.of_samples(imu or Imu("0" * 32), [(stamps, readings)])

@@ -1,5 +1,9 @@
 """Preintegration and propagation against closed forms and on recorded samples."""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -208,3 +212,21 @@ def test_free_fall_of_several_edges_one_of_them_empty():
         T[:, 4:], start_v * t[:, None] + GRAVITY * t[:, None] ** 2 / 2, atol=1e-14
     )
     np.testing.assert_allclose(velocity, start_v + GRAVITY * t[:, None], atol=1e-14)
+
+
+_COVARIANCE = (
+    "from tests.estimation.imu.motion import one_edge, sampled\n"
+    "from maplab_py.estimation.imu.preintegration import integrate\n"
+    "edge = integrate(one_edge(*sampled(0.2, 200)), [0.01] * 3, [0.1] * 3)\n"
+    "print(*edge.covariance.ravel().tolist())"
+)
+
+
+def test_it_is_the_same_without_compilation():
+    """Rows that have names are views in Python, and values where they are lowered."""
+    environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
+    child = [sys.executable, "-c", _COVARIANCE]
+    plain = subprocess.run(child, env=environment, capture_output=True, text=True, check=True)
+    compiled = integrate(one_edge(*sampled(0.2, 200)), [0.01] * 3, [0.1] * 3)
+    found = np.array([float(word) for word in plain.stdout.split()])
+    np.testing.assert_allclose(compiled.covariance.ravel(), found, rtol=1e-12)
