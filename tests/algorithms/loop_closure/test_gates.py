@@ -283,8 +283,11 @@ def test_keypoints_of_one_vertex_are_one_vote() -> None:
 
 
 def test_places_seen_too_recently_are_not_searched() -> None:
-    walks = [Walk(room=1, vertices=6), Walk(room=1, vertices=6, start_s=60.0)]
-    vi_map = make_map(walks)[0]
-    for seconds, is_found in ((50.0, True), (70.0, False)):
-        options = LoopClosureOptions(min_image_time_seconds=seconds)
-        assert search_loops(vi_map, options)[0].closures.accepted.any() == is_found
+    # many landmarks of the latest walks must not take the place of the first's, the single neighbour
+    latest = [Walk(room=1, vertices=4, start_s=60.0 + 2.5 * row) for row in range(16)]
+    vi_map = make_map([Walk(room=1, vertices=2), *latest])[0]
+    for seconds, count in ((50.0, 64), (120.0, 0)):
+        options = LoopClosureOptions(min_image_time_seconds=seconds, num_neighbors=1)
+        closures = search_loops(vi_map, options)[0].closures
+        latest_queries = closures.query_vertex[closures.accepted & (closures.query_vertex >= 2)]
+        assert len(np.unique(latest_queries)) == count
