@@ -95,10 +95,15 @@ def main() -> None:
             if file.is_file():
                 file.unlink()
 
-    put_back()
-    start = time.perf_counter()
-    os.waitpid(forked_save(new, folder), 0)
-    duration_s = time.perf_counter() - start
+    def save_duration_s() -> float:
+        put_back()
+        start = time.perf_counter()
+        os.waitpid(forked_save(new, folder), 0)
+        return time.perf_counter() - start
+
+    # the shortest of three: the first save of a busy machine takes several times as long as those
+    # that are killed, and most kills would come too late
+    duration_s = min(save_duration_s() for _ in range(3))
     outcomes = [state(folder, *contents)]
     for kill in range(kills):
         put_back()

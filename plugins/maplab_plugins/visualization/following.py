@@ -246,8 +246,10 @@ def show(
         raise UserError(
             "--viewer_file is for --viewer=rerun; export_view writes the page to a file"
         )
+    context.progress.step(0, 2, "start the viewer")
     viewer = ensure_viewer(context, viewer_options)
     check_cancelled()
+    context.progress.step(1, 2, "draw the map")
     subject = _with_history(context, in_colours(subject.replace(images=images)))
     viewer.show(subject, playback=playback)
     if plays:

@@ -15,6 +15,7 @@ from maplab_py.geometry import se3, so3
 from maplab_py.sensors import Imu, ImuIntrinsics
 from tests.estimation.imu.motion import GRAVITY, one_edge, sampled, truth
 from tests.support import imu_model
+from tests.support.data import REPOSITORY
 
 ZERO = np.zeros(3)
 INTRINSICS = ImuIntrinsics(
@@ -215,6 +216,7 @@ def test_free_fall_of_several_edges_one_of_them_empty():
 
 
 _COVARIANCE = (
+    "import sys\nsys.path.append(sys.argv[1])\n"
     "from tests.estimation.imu.motion import one_edge, sampled\n"
     "from maplab_py.estimation.imu.preintegration import integrate\n"
     "edge = integrate(one_edge(*sampled(0.2, 200)), [0.01] * 3, [0.1] * 3)\n"
@@ -225,7 +227,7 @@ _COVARIANCE = (
 def test_it_is_the_same_without_compilation():
     """Rows that have names are views in Python, and values where they are lowered."""
     environment = os.environ | {"NUMBA_DISABLE_JIT": "1"}
-    child = [sys.executable, "-c", _COVARIANCE]
+    child = [sys.executable, "-c", _COVARIANCE, str(REPOSITORY)]
     plain = subprocess.run(child, env=environment, capture_output=True, text=True, check=True)
     compiled = integrate(one_edge(*sampled(0.2, 200)), [0.01] * 3, [0.1] * 3)
     found = np.array([float(word) for word in plain.stdout.split()])
