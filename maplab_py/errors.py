@@ -12,12 +12,7 @@ class MaplabError(Exception):
     """
 
     def __init__(self, *message: object, remedy: str = "") -> None:
-        """Make an error of one line.
-
-        Args:
-            message: The line.
-            remedy: Command line that mends the cause.
-        """
+        """Make an error of one line."""
         super().__init__(*message)
         self.remedy = remedy
 

@@ -33,10 +33,6 @@ class MapBuilder:
     def __init__(self, device: RecordedSensors, options: MapBuilderOptions | None = None) -> None:
         """Start without missions.
 
-        Args:
-            device: The sensors, with an IMU.
-            options: See there.
-
         Raises:
             UserError: The temporary folder cannot be made.
         """

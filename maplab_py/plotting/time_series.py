@@ -96,9 +96,6 @@ def _with_truth(
 def inertial_states(vi_map: VIMap, mission: int) -> Figure:
     """Draw position, velocity and the two biases of a mission's vertices over time.
 
-    Args:
-        mission: Row of the mission.
-
     Raises:
         UserError: The mission has no vertices.
     """

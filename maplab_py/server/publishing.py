@@ -27,9 +27,6 @@ def pause_s(duration_s: float) -> float:
 
     Publications take a tenth of the time, within limits, so that the size of the map hardly slows the
     server down.
-
-    Args:
-        duration_s: How long a publication takes.
     """
     shortest_s, longest_s = _SECONDS_UNPUBLISHED
     return min(max(duration_s / _PUBLISHING_SHARE, shortest_s), longest_s)
@@ -63,9 +60,6 @@ class Publisher:
 
     def with_resources(self, submap: VIMap, folder: Path) -> VIMap:
         """Return a submap whose resources are, or will be, where those of the map are.
-
-        Args:
-            folder: Where its resource files are.
 
         Raises:
             MapError: A file is missing.

@@ -282,9 +282,6 @@ def with_resources_taken_in(whole: VIMap, submap: VIMap) -> VIMap:
 
     Maps that are joined refer to the resource folder of the second one as to an external folder. The server
     brings the files of submaps to the folder of its map instead (`Publisher.with_resources`).
-
-    Args:
-        whole: The map, joined with the submap.
     """
     folders = whole.metadata.external_resource_folders
     name = merge.resource_folder_name(submap.metadata)

@@ -218,9 +218,6 @@ def with_new_ids(vi_map: VIMap, rng: np.random.Generator | None = None) -> VIMap
     Sensors and resources keep theirs (both name files or entries outside the tables); so does
     everything without an id. By default the ids are derived from the map's present ids: the same
     map gets the same new ids in every run, and different ones each time it is applied again.
-
-    Args:
-        rng: Source of the ids.
     """
     if rng is None:
         rng = content_rng(vi_map, "new ids")

@@ -91,13 +91,7 @@ class Guide:
     """
 
     def __init__(self, registry: Registry, terminal: Terminal, steps: Sequence[Step]) -> None:
-        """Start at the first step.
-
-        Args:
-            registry: The commands that can be typed.
-            terminal: Where the steps are shown.
-            steps: The steps of the tour.
-        """
+        """Start at the first step."""
         self._registry, self._terminal = registry, terminal
         self._maps = MapManager()  # as the last command has left them
         self._steps = steps

@@ -35,9 +35,6 @@ def split_by_position(
     With an overlap every edge is in some cell with both its vertices, so that `join.join_cells` restores the
     map: where the overlap is shorter than an edge, the edge's second vertex is added to a cell of the first.
 
-    Args:
-        options: Number of cells and overlap.
-
     Raises:
         UserError: The map has fewer vertices than cells are wanted.
         Cancelled: The user has asked to stop.

@@ -299,11 +299,6 @@ def acceptance(
 
     Recorded closures are judged again with these flags, which admit others of them as well. A search
     may estimate other poses.
-
-    Args:
-        closures: All recorded closures.
-        row: The closure.
-        options: The present flags.
     """
     query = vi_map.vertex_index.rows(closures.query).astype(np.int64)
     place = vi_map.vertex_index.rows(closures.place).astype(np.int64)

@@ -183,11 +183,7 @@ class Uncertainty:
         return np.asarray((self.formal_sigma / self.prior_sigma) ** 2)
 
     def covariance(self, formal_scale: float = 1.0) -> F64:
-        """Return the smallest covariance (k, k) that is as large as both parts in every direction.
-
-        Args:
-            formal_scale: Factor of the formal covariance.
-        """
+        """Return the smallest covariance (k, k) that is as large as both parts in every direction."""
         formal = self.formal * formal_scale
         if self.cluster_robust is None:
             return np.asarray(formal)

@@ -158,10 +158,6 @@ _KEYS = {"name", "each", "all", "commands", "memory_gb"}
 def read_stages(value: Any, path: Path) -> tuple[Stage, ...]:
     """Read the value of the key `stages`.
 
-    Args:
-        value: What the file holds there.
-        path: The file, for messages.
-
     Raises:
         UserError: It is no list of stages, or a stage has a wrong or unknown key.
     """

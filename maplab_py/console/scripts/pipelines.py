@@ -37,10 +37,6 @@ def split_flags(
 ) -> tuple[PipelineOptions | None, list[str]]:
     """Separate the flags of `maplab batch` from the lasting flags of commands.
 
-    Args:
-        words: Flags as they were typed.
-        known: Flags of all commands.
-
     Returns:
         The options, None where no flag of the batch was given; and the other words.
 
@@ -134,11 +130,7 @@ class StageTable:
     """Shows how many tasks of each stage wait, run and have ended."""
 
     def __init__(self, terminal: output.ConsoleTerminal) -> None:
-        """Prepare the table.
-
-        Args:
-            terminal: Gets the lines.
-        """
+        """Prepare the table."""
         self._terminal = terminal
         self._live: Live | None = None
 

@@ -41,12 +41,7 @@ class Runner:
     """
 
     def __init__(self, session: Session, terminal: output.ConsoleTerminal) -> None:
-        """Make a runner.
-
-        Args:
-            session: Where the commands run.
-            terminal: Where their reports go.
-        """
+        """Make a runner."""
         self.session = session
         self.terminal = terminal
         self.wants_exit = False
@@ -141,10 +136,6 @@ class Runner:
 
     def finish(self, status: Status = Status.OK, *, discard: bool) -> Status:
         """End a script: wait for its jobs, then keep and name the maps whose changes are on no disk.
-
-        Args:
-            status: Status of the script so far.
-            discard: Changes may be lost.
 
         Returns:
             The status, or that of a user's error when a script that went well leaves changes unsaved.

@@ -17,13 +17,7 @@ def plain_text(block: Block) -> str:
 
 
 def drawn(block: Block, width: int, *, coloured: bool) -> str:
-    """Draw a block for a terminal of a width; long lines are folded at spaces.
-
-    Args:
-        block: What to draw.
-        width: Columns of the terminal.
-        coloured: Use control codes for colours.
-    """
+    """Draw a block for a terminal of a width; long lines are folded at spaces."""
     return "\n".join(_Drawing(width, coloured=coloured).lines(block))
 
 

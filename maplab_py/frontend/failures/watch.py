@@ -226,13 +226,7 @@ class SensorWatch:
     def compare(
         self, frame: WindowFrame, interval: ImuInterval, smoother: FixedLagSmoother
     ) -> None:
-        """Compare the samples and the cameras with the motion that the images show.
-
-        Args:
-            frame: The newest frame.
-            interval: Its samples as measured.
-            smoother: The window after it.
-        """
+        """Compare the samples and the cameras with the motion that the images show."""
         states, cameras_now = smoother.states, smoother.cameras
         v_I = so3.rotate(so3.inverse(states.T_M_I[-1, :4]), states.motion[-1, :3])
         rate_I = interval.accel_gyro[-1, 3:] - states.motion[-1, 3:6]

@@ -188,10 +188,6 @@ def add_clouds(
 ) -> tuple[I64, int]:
     """Add clouds to new resources; return those of the chosen rows that have points, and the number without.
 
-    Args:
-        new: Gets the clouds.
-        clouds: Row, and what reads its cloud.
-
     Raises:
         MapError: A cloud is damaged, or all are empty.
     """

@@ -97,9 +97,6 @@ def read_columns(path: Path, facts: Mapping[str, Any]) -> tuple[VIMap, dict[str,
 
     The file may be replaced or deleted while it is mapped: the map keeps what it has.
 
-    Args:
-        facts: What the header must say.
-
     Raises:
         UnusableColumns: The file is not what `write_columns` has written for these facts.
         OSError: It cannot be read.

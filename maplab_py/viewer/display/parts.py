@@ -59,10 +59,6 @@ class Nodes:
         """Send what differs from what is drawn; return the number of nodes that were sent.
 
         Only visible layers are sent; those that are hidden follow when they are shown.
-
-        Args:
-            layers: Names of visible layers.
-            missions: Ids of visible missions.
         """
         scene = with_end_labels(scene, missions)
         wanted = {

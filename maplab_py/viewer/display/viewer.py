@@ -141,9 +141,6 @@ class Viewer:
     def show(self, subject: Subject, *, playback: PlaybackOptions | None = None) -> Scene:
         """Show a subject now.
 
-        Args:
-            playback: How the time slider plays it.
-
         Raises:
             UserError: There is nothing to show.
         """

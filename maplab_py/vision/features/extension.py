@@ -110,11 +110,6 @@ def checked(
 ) -> tuple[ExtractedFeatures, DescriptorKind]:
     """Return features of a plugin with their types, and the kind of their descriptors.
 
-    Args:
-        features: What the plugin returned.
-        feature_type: Type of its descriptors.
-        what: Name of the extractor, for messages.
-
     Raises:
         MaplabError: Shapes or types are wrong, or a position is not a number.
     """

@@ -40,10 +40,6 @@ class _Refused(Exception):
 def read_checkpoint(content: bytes, name: str) -> Arrays:
     """Return the arrays of a checkpoint by name; nothing of it is executed.
 
-    Args:
-        content: The file.
-        name: Its name, for messages.
-
     Raises:
         UserError: It is damaged, or its pickle names anything but arrays.
     """

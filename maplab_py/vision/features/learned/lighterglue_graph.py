@@ -26,10 +26,6 @@ def lighterglue_graph(arrays: Arrays, name: str) -> bytes:
     side, `descriptors` (2, P, N, 64), and `absence` (2, P, 1, N), zero or, where an image has fewer
     keypoints, a very negative number. Output is `scores` (P, N, N), logarithms of probabilities.
 
-    Args:
-        arrays: Arrays of a checkpoint.
-        name: Its name, for messages.
-
     Raises:
         UserError: Arrays are missing, or have another shape than this network's; onnx is not installed.
     """

@@ -25,10 +25,6 @@ def xfeat_graph(arrays: Arrays, name: str) -> bytes:
 
     H and W are multiples of 32. Descriptors have unit length.
 
-    Args:
-        arrays: Arrays of a checkpoint.
-        name: Its name, for messages.
-
     Raises:
         UserError: Arrays are missing, or have another shape than this network's; onnx is not installed.
     """
