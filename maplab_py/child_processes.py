@@ -174,7 +174,6 @@ class ServiceEnded(Exception):
     """A service has ended with a status; negative for a signal."""
 
     def __init__(self, status: int) -> None:
-        """Keep the status."""
         super().__init__(f"ended with status {status}")
         self.status = status
 

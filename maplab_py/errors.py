@@ -12,7 +12,6 @@ class MaplabError(Exception):
     """
 
     def __init__(self, *message: object, remedy: str = "") -> None:
-        """Make an error of one line."""
         super().__init__(*message)
         self.remedy = remedy
 

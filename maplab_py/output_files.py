@@ -30,7 +30,6 @@ class PlannedFile:
     replaces: bool
 
     def __str__(self) -> str:
-        """Describe the planned action."""
         verb = "replace" if self.replaces else "write"
         return f"would {verb} {self.path} ({self.size_bytes:,} bytes)"
 
@@ -53,7 +52,6 @@ class StagedFiles:
     """Complete files under temporary names that are published together."""
 
     def __init__(self) -> None:
-        """Start without files."""
         self.files: list[PendingFile] = []
 
     def add(self, path: Path, chunks: Iterable[bytes]) -> None:

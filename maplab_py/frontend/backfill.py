@@ -40,7 +40,6 @@ class WaitingFrames:
     """The latest frames without states, with all samples between them."""
 
     def __init__(self) -> None:
-        """Begin without frames."""
         self.frames: list[WindowFrame] = []
         self.stamps_ns: list[int] = []
         self._before: tuple[I64, F64] = (np.zeros(0, dtype=np.int64), np.zeros((0, 6)))

@@ -15,7 +15,6 @@ class HealthMonitor:
     """Compares the estimates of one start with the limits."""
 
     def __init__(self, options: HealthOptions) -> None:
-        """Start with a healthy estimate."""
         self._options = options
         self._tracked_ns = -1
         self._newest_ns = -1

@@ -28,7 +28,6 @@ class DelayMonitor:
     """
 
     def __init__(self, device: RecordedSensors) -> None:
-        """Begin without a measurement."""
         self.recalibrate(device)
         self._mean_s, self._variance = 0.0, _PRIOR_SIGMA_S**2
         self.applied_s = 0.0

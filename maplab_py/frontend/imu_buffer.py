@@ -32,7 +32,6 @@ class ImuBuffer:
     """Samples that no interval has used yet, and the latest that one has."""
 
     def __init__(self) -> None:
-        """Start without samples."""
         self._times_ns = np.zeros(0, dtype=np.int64)
         self._accel_gyro = np.zeros((0, 6))
 

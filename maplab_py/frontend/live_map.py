@@ -17,7 +17,6 @@ class LiveLandmarks:
     """Landmarks of the smoother by track, those included that have left the window."""
 
     def __init__(self) -> None:
-        """Start without landmarks."""
         self._places: dict[int, F64] = {}
 
     def __len__(self) -> int:
@@ -41,7 +40,6 @@ class LiveLocalization:
     """The path in a map in which the run is localised, and the latest matches."""
 
     def __init__(self) -> None:
-        """Start without a path."""
         self.T_G_M: F64 | None = None  # as it was estimated last
         self._path: list[F64] = []
         self.rays_G: F64 = np.zeros(

@@ -20,7 +20,6 @@ class MotionDetector:
     """Classifies the motion between frames."""
 
     def __init__(self, options: odometry_options.RestOptions | None = None) -> None:
-        """Start without samples."""
         self._options = options or odometry_options.RestOptions()
         self._keypoints = disparity.RecentKeypoints(self._options.imu_time_s)
         self.reset()

@@ -34,7 +34,6 @@ class RecordedMission:
     """Vertices of a mission with the IMU samples between them."""
 
     def __init__(self) -> None:
-        """Start without vertices."""
         self.states: list[nav_state.NavState] = []
         self.frames: list[VertexFrames] = []
         self.image_rows: list[Sequence[int]] = []  # of new resources, -1 = none

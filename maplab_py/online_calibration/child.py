@@ -17,7 +17,6 @@ class Answerer:
     """Answers requests; the first of them opens the database."""
 
     def __init__(self) -> None:
-        """Wait for the first request."""
         self._calibration: process.DeviceCalibration | None = None
 
     def __call__(self, request: process.Opening | process.Piece | process.Finish) -> process.Status:

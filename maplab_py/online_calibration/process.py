@@ -84,7 +84,6 @@ class Missing:
     motion: str = ""  # words of the best one
 
     def __str__(self) -> str:
-        """Return it in words."""
         return f"{self.segments} needed; {self.motion}" if self.segments else ""
 
 

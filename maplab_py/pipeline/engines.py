@@ -44,7 +44,6 @@ class SequentialEngine:
     address = ""
 
     def __init__(self) -> None:
-        """Start without orders."""
         self._orders: deque[messages.Order] = deque()
 
     def slots(self) -> int:
@@ -68,11 +67,9 @@ class SequentialEngine:
         return execution.execute(self._orders.popleft())
 
     def __enter__(self) -> Self:
-        """Start."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Forget the orders."""
         self._orders.clear()
 
 

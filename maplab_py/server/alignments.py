@@ -54,7 +54,6 @@ class OpenAlignments:
     """The pairs, with the numbers of the submaps that showed them."""
 
     def __init__(self) -> None:
-        """Start without pairs."""
         self._pairs: dict[tuple[str, str], frozenset[int]] = {}
 
     def copy(self) -> OpenAlignments:

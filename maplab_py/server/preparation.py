@@ -40,7 +40,6 @@ class Preparation:
     """Gives submaps to workers, a few at a time."""
 
     def __init__(self, spool: Spool, options: SubmapOptions, stationary: StationaryOptions) -> None:
-        """Start without workers."""
         self._spool, self._options, self._stationary = spool, options, stationary
         workers = options.submap_loading_thread_pool_size
         self._workers = WorkerPool(max(1, (os.cpu_count() or 1) // workers))
@@ -256,7 +255,6 @@ class Intake:
     def __init__(
         self, spool: Spool, preparation: Preparation, publisher: Publisher, events: Events
     ) -> None:
-        """Start without submaps."""
         self.items: dict[int, Item] = {}
         self.rejected = 0
         self._spool, self._preparation = spool, preparation

@@ -83,7 +83,6 @@ class Service:
         )
 
     def __enter__(self) -> Self:
-        """Start to answer."""
         content = {"url": self.url, "token": self.token, "process": os.getpid()}
         write_file(self._file, [b""])
         self._file.chmod(0o600)  # the permissions stay when the content comes
@@ -92,7 +91,6 @@ class Service:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Stop."""
         self._server.shutdown()
         self._server.server_close()
         self._file.unlink(missing_ok=True)

@@ -77,7 +77,6 @@ class _Deviation:
     """Draws the deviations of the true values in a fixed order."""
 
     def __init__(self, scenario: Scenario, device: int, session: int) -> None:
-        """Seed by device and by session."""
         self._options = scenario.calibration
         base = [scenario.seeds.world, _DEVIATION_STREAM, device]
         self._of_device = np.random.default_rng(base)

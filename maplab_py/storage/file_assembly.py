@@ -23,7 +23,6 @@ class FileParts:
     """Content of the files of a map, as far as it has been read."""
 
     def __init__(self) -> None:
-        """Start without files."""
         self.facts: list[FileFacts] = []
         self.vertices: list[vertex_parts.VertexPart] = []
         self.unpacked_bytes = 0

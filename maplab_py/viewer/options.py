@@ -109,7 +109,6 @@ class VisualizationOptions(Options, prefix="vis_"):
     """Shift every mission by this much against the one before, along x."""
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         super().__post_init__()
         reason = self.refused_closures_reason
         if reason and not any(reason.lower() in verdict.value for verdict in Verdict):

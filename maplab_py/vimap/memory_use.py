@@ -15,7 +15,6 @@ class SharedColumns:
     """Bytes of several maps; a shared column counts for the first map only."""
 
     def __init__(self) -> None:
-        """Start without maps."""
         self._seen: set[tuple[int, int]] = set()
 
     def add(

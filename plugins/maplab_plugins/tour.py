@@ -91,7 +91,6 @@ class Guide:
     """
 
     def __init__(self, registry: Registry, terminal: Terminal, steps: Sequence[Step]) -> None:
-        """Start at the first step."""
         self._registry, self._terminal = registry, terminal
         self._maps = MapManager()  # as the last command has left them
         self._steps = steps

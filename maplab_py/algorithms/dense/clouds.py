@@ -32,7 +32,6 @@ class CloudMaker:
     """Makes clouds of the depth maps of one camera."""
 
     def __init__(self, camera: Camera) -> None:
-        """Compute the rays of all pixels."""
         u, v = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
         rays, valid = projection.back_project(camera, np.stack([u, v], axis=-1))
         self._valid = valid & (rays[..., 2] > 0.0)

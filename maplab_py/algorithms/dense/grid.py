@@ -56,7 +56,6 @@ class TsdfGrid:
     """
 
     def __init__(self, settings: GridSettings) -> None:
-        """Start without blocks."""
         self.settings = settings
         self.count = 0
         self._coordinates: I32 = np.zeros((0, 3), dtype=np.int32)

@@ -29,7 +29,6 @@ class FusionOptions(Options, prefix="dense_tsdf_"):
     """Integrate every n-th depth map only"""
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         super().__post_init__()
         if not self.min_ray_length_m < self.max_ray_length_m < float("inf"):
             raise FlagError(
@@ -54,7 +53,6 @@ class DistanceOptions(Options, prefix="dense_esdf_"):
     distance as intensity"""
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         super().__post_init__()
         if not self.clear_sphere_inner_radius <= self.clear_sphere_outer_radius:
             raise FlagError(
@@ -156,7 +154,6 @@ class StereoOptions(Options, prefix="dense_stereo_"):
     """Part of each mission's vertices up to the last that is used"""
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         super().__post_init__()
         start = self.debug_reconstruction_start_fraction_of_trajectory
         if not start < self.debug_reconstruction_end_fraction_of_trajectory:

@@ -30,7 +30,6 @@ class ExtractionOptions(Options):
     observations; else those frames stay as they are"""
 
     def __post_init__(self) -> None:
-        """Check the values."""
         super().__post_init__()
         if self.feature_type not in KINDS and not self.feature_type.startswith(PLUGIN):
             raise FlagError(

@@ -33,7 +33,6 @@ class LandmarkQualityOptions(Options, prefix="elq_"):
     """Largest distance of any lidar observation from its landmark; negative = not checked."""
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         super().__post_init__()
         for prefix in ("", "lidar_"):
             low = getattr(self, f"{prefix}min_distance_from_closest_observer")

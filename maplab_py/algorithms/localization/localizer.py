@@ -71,7 +71,6 @@ class Localizer:
     """Localises queries in an indexed map."""
 
     def __init__(self, database: LocalizationMap, options: LocalizationOptions) -> None:
-        """Build the index."""
         self._map = database
         self._options = options
         kind = database.projection.kind

@@ -364,7 +364,6 @@ class ProjectionMemory:
     """
 
     def __init__(self) -> None:
-        """Start without a projection."""
         self._projection: DescriptorProjection | None = None
         self._descriptors = 0
 

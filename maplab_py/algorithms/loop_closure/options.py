@@ -26,7 +26,6 @@ class FeatureTypeOptions(Options, prefix="lc_"):
     (61); empty = those of the most frequent length"""
 
     def __post_init__(self) -> None:
-        """Check the type."""
         super().__post_init__()
         try:
             type_of_name(self.feature_type)

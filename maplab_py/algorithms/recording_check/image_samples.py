@@ -67,7 +67,6 @@ class CameraSampler:
     """Takes images of one camera, and follows points from each to the next."""
 
     def __init__(self, camera: Camera, row: int) -> None:
-        """Begin without images."""
         factor = 1.0
         while camera.width_px * factor > _WIDEST_PX:
             factor *= 0.5

@@ -33,7 +33,6 @@ class SparsificationOptions(Options, prefix="sparsification_"):
     """Seed of the random choice."""
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         super().__post_init__()
         if self.method not in METHODS:
             raise FlagError(f"--sparsification_method={self.method}: one of {', '.join(METHODS)}")

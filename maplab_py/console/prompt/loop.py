@@ -69,7 +69,6 @@ class CommandCompleter(Completer):
     """Offers the session's candidates to prompt_toolkit."""
 
     def __init__(self, session: Session) -> None:
-        """Complete for one session."""
         self._session = session
 
     def get_completions(
@@ -94,7 +93,6 @@ class CommandLexer(Lexer):
     """Colours commands, flags and values; an unknown command is red."""
 
     def __init__(self, session: Session) -> None:
-        """Colour for one session."""
         self._session = session
 
     def lex_document(self, document: Document) -> Callable[[int], StyleAndTextTuples]:

@@ -130,7 +130,6 @@ class StageTable:
     """Shows how many tasks of each stage wait, run and have ended."""
 
     def __init__(self, terminal: output.ConsoleTerminal) -> None:
-        """Prepare the table."""
         self._terminal = terminal
         self._live: Live | None = None
 

@@ -41,7 +41,6 @@ class Runner:
     """
 
     def __init__(self, session: Session, terminal: output.ConsoleTerminal) -> None:
-        """Make a runner."""
         self.session = session
         self.terminal = terminal
         self.wants_exit = False

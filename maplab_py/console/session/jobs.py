@@ -30,7 +30,6 @@ class JobProgress:
     """Progress of a job, shown by the command `jobs`."""
 
     def __init__(self, job: Job) -> None:
-        """Create it for one job."""
         self._job = job
 
     def step(self, done: float, total: float, what: str = "") -> None:
@@ -52,7 +51,6 @@ class JobTerminal(SilentTerminal):
     """Terminal of a job, whose report and notes are shown by `join`."""
 
     def __init__(self, job: Job) -> None:
-        """Create it for one job."""
         self._job = job
 
     def note(self, text: str) -> None:

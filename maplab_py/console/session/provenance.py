@@ -42,7 +42,6 @@ class Provenance:
     """The commands that led to each value of the maps of a session."""
 
     def __init__(self) -> None:
-        """Start without values."""
         self._scripts: weakref.WeakKeyDictionary[VIMap, dict[str, Script]] = (
             weakref.WeakKeyDictionary()
         )

@@ -158,7 +158,6 @@ class Session:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Release the maps."""
         self.watchers.close()
         self.maps = MapManager()
 

@@ -41,7 +41,6 @@ class Settings:
     """The lasting flag values of a session."""
 
     def __init__(self, registry: Registry) -> None:
-        """Create empty settings."""
         self._registry = registry
         self._layers: dict[Layer, dict[str, Setting]] = {layer: {} for layer in Layer}
 

@@ -143,7 +143,6 @@ class NotedInterrupts:
     """
 
     def __init__(self) -> None:
-        """Start without one."""
         self.is_noted = False
         self.instead: Callable[[], None] | None = None
 

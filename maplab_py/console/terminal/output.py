@@ -188,7 +188,6 @@ class ConsoleTerminal:
     """
 
     def __init__(self, *, as_json: bool = False) -> None:
-        """Make the terminal of this process."""
         self.as_json = as_json
         self.is_prompt = False  # a user reads the output directly
         self.position = ""  # of the running command in its script, before its name in the bar

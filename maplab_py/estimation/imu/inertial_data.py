@@ -36,7 +36,6 @@ class InertialData:
     edge_id: NDArray[np.uint64] | None = None  # (E, 2), for messages
 
     def __post_init__(self) -> None:
-        """Check times and numbers."""
         step = np.diff(self.timestamp_ns)
         last = self.sample_start[1:-1] - 1  # the step from one edge's last sample to the next edge
         step[last[(last >= 0) & (last < len(step))]] = 0

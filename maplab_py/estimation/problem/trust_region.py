@@ -124,7 +124,6 @@ class Decreases:
     """The last decreases of the cost, and a prediction of the next ones."""
 
     def __init__(self) -> None:
-        """Begin without any decrease."""
         self._previous = self._last = 0.0
 
     def add(self, decrease: float) -> None:

@@ -48,7 +48,6 @@ class WindowFrame:
     failed: ImuPart = NO_PART  # parts of the IMU whose samples say next to nothing
 
     def __post_init__(self) -> None:
-        """Check the lengths."""
         counts = {len(x) for x in (self.camera, self.track_id, self.uv_px, self.sigma_px)}
         if len(counts) > 1 or len(self.imu_times_ns) != len(self.accel_gyro):
             raise UserError(f"the columns of the frame at {self.time_ns} ns differ in length")

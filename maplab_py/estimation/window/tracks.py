@@ -38,7 +38,6 @@ class Tracks:
     """
 
     def __init__(self) -> None:
-        """Begin without tracks."""
         self.id: I64 = np.zeros(0, dtype=np.int64)
         self.is_landmark: Mask = np.zeros(0, dtype=np.bool_)
         self.is_closed: Mask = np.zeros(0, dtype=np.bool_)

@@ -25,7 +25,6 @@ class ImageWatch:
     """Watches the images of one camera."""
 
     def __init__(self) -> None:
-        """Begin without images."""
         self._last: U8 | None = None
         self._next_ns, self._repeats, self._since_ns = 0, 0, 0
         self._contrast: collections.deque[float] = collections.deque(maxlen=_SAMPLES)

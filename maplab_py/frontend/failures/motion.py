@@ -71,7 +71,6 @@ class MotionComparison:
     """Keeps frames of the last half second, and compares."""
 
     def __init__(self, device: RecordedSensors, imu: Imu) -> None:
-        """Compare the sensors of a device."""
         self._imu, self._T_I_C = imu, device.T_I_C
         self._tables = [RayTable.of(camera) for camera in device.cameras]
         self._frames: collections.deque[Sighting] = collections.deque()

@@ -22,7 +22,6 @@ class SampleWatch:
     """Counts equal samples of every axis."""
 
     def __init__(self) -> None:
-        """Begin without samples."""
         self._last: F64 | None = None
         self._run = np.zeros(6, dtype=np.int64)  # equal samples up to now
         self._run_ns = np.zeros(6, dtype=np.int64)  # time of the first of them

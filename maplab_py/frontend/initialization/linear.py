@@ -130,7 +130,6 @@ class _Lines:
     def __init__(
         self, rays: SegmentRays, direction: F64, lever: F64, p: _Affine, rows: Mask
     ) -> None:
-        """Take the rays in a mask."""
         self._rows, self._count = np.flatnonzero(rows), len(rows)
         track = rays.track[rows]
         self._first = np.flatnonzero(np.diff(track, prepend=-1))

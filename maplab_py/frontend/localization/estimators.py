@@ -24,7 +24,6 @@ class MapEstimator:
     """Estimates T_G_M from matches; unless a mode does, it does not change the odometry."""
 
     def __init__(self) -> None:
-        """Begin without a map."""
         self.T_G_M: F64 | None = None
         self.covariance = np.full((6, 6), np.inf)  # of T_G_M
         self.associated: MapTracks | None = None
@@ -139,7 +138,6 @@ class PoseEstimator(MapEstimator):
     """ROVIOLI's loose coupling: T_G_M from the poses of single images with their covariances."""
 
     def __init__(self) -> None:
-        """Begin without poses."""
         super().__init__()
         self._poses: dict[int, tuple[F64, F64]] = {}
 

@@ -48,7 +48,6 @@ class MapMatcher:
     """Matches frames with an indexed map."""
 
     def __init__(self, searched: SearchedMap, options: OnlineLocalizationOptions) -> None:
-        """Build the index."""
         self._map, self._options = searched, options
         self._matching = dataclasses.replace(
             options.matching,

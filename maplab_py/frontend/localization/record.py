@@ -26,7 +26,6 @@ class LocalizationRecord:
     """Collects the poses of a run."""
 
     def __init__(self) -> None:
-        """Begin without frames."""
         self._times_ns = array("q")
         self._rows = array("d")  # rows of 33 numbers
 

@@ -34,7 +34,6 @@ class PosePublisher:
     """Publishes estimates as odometry, pose in the map and transforms."""
 
     def __init__(self, transport: Transport, options: LiveOptions) -> None:
-        """Announce the topics."""
         self._options, self._is_ros_2 = options, transport.is_ros_2
         self._odometry = transport.advertise(ODOMETRY_TOPIC, ODOMETRY_TYPE)
         self._pose = transport.advertise(POSE_TOPIC, POSE_TYPE)

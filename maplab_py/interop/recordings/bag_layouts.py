@@ -41,7 +41,6 @@ class MessageLayout:
     """Places of the fields of a message, when its texts are known."""
 
     def __init__(self, *, is_ros_2: bool) -> None:
-        """Start with an empty message."""
         self._is_ros_2 = is_ros_2
         self._template = bytearray(_CDR_LITTLE_ENDIAN if is_ros_2 else b"")
         self._origin = len(self._template)

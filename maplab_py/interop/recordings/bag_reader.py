@@ -70,7 +70,6 @@ class BagReader:
         self.connections: list[interfaces.Connection] = []
 
     def __enter__(self) -> BagReader:
-        """Open all files."""
         try:
             self._open()
         except BaseException:
@@ -79,7 +78,6 @@ class BagReader:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close them."""
         self._stack.close()
 
     @property

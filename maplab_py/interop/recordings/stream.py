@@ -86,7 +86,6 @@ class EventStream:
     """
 
     def __init__(self, recording: protocol.Recording, options: StreamOptions | None = None) -> None:
-        """Prepare a stream."""
         self._recording = recording
         self._options = options or StreamOptions()
         cameras = len(recording.device.cameras)

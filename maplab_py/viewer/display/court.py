@@ -56,7 +56,6 @@ class Court:
     """The widgets, the case that is open, and the verdicts."""
 
     def __init__(self, viewer: Viewer) -> None:
-        """Start without cases."""
         self._viewer = viewer
         self._cases = np.zeros(0, dtype=np.int64)
         self._map: VIMap | None = None

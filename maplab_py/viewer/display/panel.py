@@ -222,7 +222,6 @@ class TimeMachine:
     """The slider of the history; it is there when the map has more than one state."""
 
     def __init__(self, viewer: Viewer) -> None:
-        """Make the widgets."""
         self._lock, gui = viewer.lock, viewer.server.gui
         self._folder = gui.add_folder("History", order=1.5, visible=False)
         with self._folder:
@@ -287,7 +286,6 @@ class MotionRequest:
     """Place above the layers that asks for the motion which a calibration lacks."""
 
     def __init__(self, viewer: Viewer) -> None:
-        """Ask for nothing."""
         self._lock = viewer.lock
         self._html = viewer.server.gui.add_html("", order=0.5, visible=False)
 

@@ -48,7 +48,6 @@ class Nodes:
     """
 
     def __init__(self, server: viser.ViserServer) -> None:
-        """Start with an empty scene."""
         self._server = server
         self._nodes: dict[_NodeKey, _Node] = {}
         self._ground: list[Any] = []

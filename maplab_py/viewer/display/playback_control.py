@@ -36,7 +36,6 @@ class Playback:
     """
 
     def __init__(self, viewer: Viewer) -> None:
-        """Show the whole map at first."""
         self._viewer = viewer
         self.time_line = TimeLine(viewer, self)
         self.player: Player | None = None
@@ -303,7 +302,6 @@ class TimeLine:
     """The widgets, in a window of their own that a user can move, minimise and dock."""
 
     def __init__(self, viewer: Viewer, playback: Playback) -> None:
-        """Make the widgets."""
         self._playback, gui = playback, viewer.server.gui
         self._is_sliding = False
         self.is_playing = False

@@ -91,7 +91,6 @@ class Selection:
     """Selected entity of a page, and its marks in the scene; without a page, that of pages to come."""
 
     def __init__(self, page: Any = None, widgets: _Widgets | None = None) -> None:
-        """Start with nothing picked."""
         self._page = page
         self._widgets = widgets
         self._handles: list[Any] = []

@@ -75,7 +75,6 @@ class ChangeImages:
     def __init__(
         self, before: tuple[VIMap, ImageOf], after: tuple[VIMap, ImageOf], changes: Sequence[Change]
     ) -> None:
-        """Take both maps with their images."""
         self._image_of = (before[1], after[1])
         rows = before[0].vertex_index.rows(_ids([c.view_before for c in changes]))
         partners = after[0].vertex_index.rows(_ids([c.view_after for c in changes]))

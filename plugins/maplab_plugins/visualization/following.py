@@ -67,7 +67,6 @@ class Following:
     """Keeps a viewer in step with the selected map."""
 
     def __init__(self, viewer: Viewer) -> None:
-        """Follow with a running viewer."""
         self.viewer = viewer
 
     def after_command(self, maps: MapManager) -> None:

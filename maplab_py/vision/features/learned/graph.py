@@ -16,7 +16,6 @@ class Graph:
     """Nodes and constants of a graph that grows."""
 
     def __init__(self, arrays: Arrays, name: str, network: str) -> None:
-        """Begin an empty graph."""
         self._arrays, self._name, self._network = arrays, name, network
         self._nodes: list[tuple[tuple[str, list[str], list[str]], dict[str, Any]]] = []
         self._constants: dict[str, F32] = {}
