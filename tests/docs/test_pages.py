@@ -40,6 +40,22 @@ def test_command_pages_are_those_of_the_registry() -> None:
     assert stale == [], "run docs/scripts/generate_command_pages.py"
 
 
+def test_the_picture_shows_every_package_with_about_its_lines(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.syspath_prepend(DOCS / "scripts")
+    script = script_module("draw_rooms")
+    title = re.compile(r"<title>(\S+?):? ([\d,]+)(?: lines)?</title>")
+    shown, present = (
+        {name: int(lines.replace(",", "")) for name, lines in title.findall(text)}
+        for text in (script.TARGET.read_text(), script.drawing())
+    )
+    assert {"maplab_plugins", "estimation", "estimation/window", "vimap"} <= set(present)
+    assert set(shown) == set(present), "run docs/scripts/draw_rooms.py"
+    stale = [name for name, lines in shown.items() if abs(lines - present[name]) > 0.25 * lines]
+    assert stale == [], "run docs/scripts/draw_rooms.py"
+
+
 def _flag_sections() -> dict[str, tuple[set[str], set[str]]]:
     """Return the flags that each section and each entry tells, and its links, by page#anchor."""
     entry = re.compile(r"^\[`--(\w+)`\]\(#([\w-]+)\)\{#\2\}.*\n: ", re.MULTILINE)
