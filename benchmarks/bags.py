@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
+from maplab_py.interop.bags.sensor_messages import MessageMaker
 from maplab_py.interop.recordings.bag_files import opened_bag
-from maplab_py.interop.recordings.bag_layouts import imu_messages
 from maplab_py.interop.recordings.bag_writing import BagFormat, messages_of_topic, write_bag
 from maplab_py.interop.recordings.bags import BagRecording
 from maplab_py.interop.recordings.protocol import ImuBatch, RecordedSensors
@@ -61,7 +61,9 @@ def measure(kind: BagFormat, messages: int = MESSAGES, repeats: int = 3) -> BagF
                 for name in ("ours", "objects")
             )
             marks = [time.process_time()]
-            rows = imu_messages(content.imu_ns, content.accel_gyro, "imu", is_ros_2=kind.is_ros_2)
+            rows = MessageMaker(is_ros_2=kind.is_ros_2).imu(
+                content.imu_ns, content.accel_gyro, "imu"
+            )
             write_bag(path, kind, messages_of_topic(content.imu_ns, _TOPIC, _TYPE, rows))
             marks.append(time.process_time())
             batches = [b for b in BagRecording(path, device).items() if isinstance(b, ImuBatch)]

@@ -13,16 +13,15 @@ from maplab_py.array_types import F64, I64
 from maplab_py.errors import UserError
 from maplab_py.interop.bags import sensor_messages
 from maplab_py.interop.bags.options import BagExportOptions, BagReport, written_topics
-from maplab_py.interop.bags.poses import TF_TOPIC, TF_TYPE
+from maplab_py.interop.bags.poses import TF_TOPIC
 from maplab_py.interop.ply import PlyCloud, parse_ply
-from maplab_py.interop.recordings import bag_layouts, bag_writing, map_replay
+from maplab_py.interop.recordings import bag_writing, map_replay
 from maplab_py.progress import SILENT, Progress
 from maplab_py.storage.resources.store import ResourceStore
 from maplab_py.vimap import LandmarkQuality, MissionSensor, ResourceOwner, VIMap, queries, to_hex
 
 _IMAGES, _DEPTH, _CLOUDS = (0, 4), (8,), (16, 17, 21)
 """Numbers of the resource types."""
-_POSE = "geometry_msgs/msg/PoseStamped"
 _FRAME = "map"
 _CLOSURE_COLOUR = (0.9, 0.4, 0.0, 1.0)
 
@@ -134,7 +133,6 @@ class MissionStreams:
         options: BagExportOptions,
     ) -> None:
         self._map, self._mission, self._options = vi_map, mission, options
-        self._is_ros_2 = kind.is_ros_2
         self._store = ResourceStore(vi_map, map_folder)
         self._maker = sensor_messages.MessageMaker(is_ros_2=kind.is_ros_2)
         start, stop = vi_map.vertex_start[mission : mission + 2].tolist()
@@ -147,13 +145,9 @@ class MissionStreams:
 
     def poses(self) -> list[MessageStream]:
         """Poses T_G_I."""
-        rows = bag_layouts.pose_messages(
-            self._times_ns,
-            self._map.T_G_I[self._vertices],
-            self._options.world_frame,
-            is_ros_2=self._is_ros_2,
-        )
-        return [_stream("/pose", _POSE, self._times_ns, rows)]
+        T_G_I = self._map.T_G_I[self._vertices]
+        rows = self._maker.poses(self._times_ns, T_G_I, self._options.world_frame)
+        return [_stream("/pose", sensor_messages.POSE, self._times_ns, rows)]
 
     def path(self) -> list[MessageStream]:
         """All poses T_G_I in a message, at the last time."""
@@ -166,14 +160,13 @@ class MissionStreams:
     def odometry(self) -> list[MessageStream]:
         """Poses T_M_I with velocities."""
         table = self._map.vertices
-        rows = bag_layouts.odometry_messages(
+        rows = self._maker.odometry(
             self._times_ns,
             table.T_M_I[self._vertices],
             table.v_M[self._vertices],
             (self._options.odom_frame, self._options.base_frame),
-            is_ros_2=self._is_ros_2,
         )
-        return [_stream("/odometry", "nav_msgs/msg/Odometry", self._times_ns, rows)]
+        return [_stream("/odometry", sensor_messages.ODOMETRY, self._times_ns, rows)]
 
     def tf(self) -> list[MessageStream]:
         """The tree G, M, I and cameras at the time of each vertex."""
@@ -188,8 +181,8 @@ class MissionStreams:
         for camera in range(len(self._cameras)):
             T_I_C = self._map.sensors.T_I_S(self._imu_id, self._cameras[camera].id)
             tree.append((_repeated(T_I_C, count), (names.base_frame, f"cam{camera}")))
-        rows = bag_layouts.tf_messages(self._times_ns, tree, is_ros_2=self._is_ros_2)
-        return [_stream(TF_TOPIC, TF_TYPE, self._times_ns, rows)]
+        rows = self._maker.trees(self._times_ns, tree)
+        return [_stream(TF_TOPIC, sensor_messages.TREE, self._times_ns, rows)]
 
     def imu(self) -> list[MessageStream]:
         """IMU samples, each once."""
@@ -198,11 +191,9 @@ class MissionStreams:
         rows = map_replay.mission_sample_rows(self._map, self._mission)
         times_ns = self._map.imu_samples.timestamp_ns[rows]
         samples = self._map.imu_samples.accel_gyro[rows]
-        messages = bag_layouts.imu_messages(
-            times_ns, samples, self._options.base_frame, is_ros_2=self._is_ros_2
-        )
+        messages = self._maker.imu(times_ns, samples, self._options.base_frame)
         topic = _absolute(self._map.sensors.imu(self._imu_id).topic or "imu0")
-        return [_stream(topic, "sensor_msgs/msg/Imu", times_ns, messages)]
+        return [_stream(topic, sensor_messages.IMU, times_ns, messages)]
 
     def images(self, kinds: tuple[int, ...], name: str) -> list[MessageStream]:
         """Images of frames, of some types of resources, and the calibration of their cameras."""
@@ -292,11 +283,11 @@ def _mission(
     if not len(times_ns):
         return []
     name = "".join(letter if letter.isalnum() else "_" for letter in label)
-    poses = bag_layouts.pose_messages(times_ns, T_G_I, _FRAME, is_ros_2=True)
+    poses = maker.poses(times_ns, T_G_I, _FRAME)
     path = maker.path(times_ns, T_G_I, _FRAME)
     return [
         _stream(f"/mission_{name}/path", sensor_messages.PATH, begin_ns, [path]),
-        _stream(f"/mission_{name}/pose", _POSE, times_ns, poses),
+        _stream(f"/mission_{name}/pose", sensor_messages.POSE, times_ns, poses),
     ]
 
 

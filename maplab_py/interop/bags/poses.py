@@ -10,14 +10,14 @@ import numpy as np
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
+from maplab_py.interop.bags import sensor_messages
 from maplab_py.interop.bags.options import BagReport, PoseToBagOptions, written_topics
-from maplab_py.interop.recordings import bag_files, bag_layouts, bag_writing
+from maplab_py.interop.recordings import bag_files, bag_writing
 from maplab_py.interop.vertex_states import poses_at
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap, mission_labels, mission_time_spans_ns
 
-TF_TOPIC, TF_TYPE = "/tf", "tf2_msgs/msg/TFMessage"
-_TRANSFORM_TYPE = "geometry_msgs/msg/TransformStamped"
+TF_TOPIC = "/tf"
 _S_TO_NS = 1e9
 
 
@@ -134,6 +134,7 @@ def _added(
 ) -> list[Iterator[bag_writing.BagMessage]]:
     """Return the streams of messages of a mission; topics that the bag has go on in their channel."""
     world, odom, base = poses.frames
+    maker = sensor_messages.MessageMaker(is_ros_2=kind.is_ros_2)
     T_G_M, T_M_I = np.broadcast_to(poses.T_G_M, poses.T_M_I.shape), poses.T_M_I
     streams: list[tuple[str, str, list[bytes]]] = []
     if options.add_transform_stamped:
@@ -142,12 +143,12 @@ def _added(
             ("T_M_I", T_M_I, (odom, base)),
             ("T_G_M", T_G_M, (world, odom)),
         ):
-            rows = bag_layouts.transform_messages(poses.times_ns, T, frames, is_ros_2=kind.is_ros_2)
-            streams.append((f"/{name}{poses.suffix}", _TRANSFORM_TYPE, rows))
+            rows = maker.transforms(poses.times_ns, T, frames)
+            streams.append((f"/{name}{poses.suffix}", sensor_messages.TRANSFORM, rows))
     if options.add_tf:
         tree = [(T_G_M, (world, odom)), (T_M_I, (odom, base))]
-        rows = bag_layouts.tf_messages(poses.times_ns, tree, is_ros_2=kind.is_ros_2)
-        streams.append((TF_TOPIC, TF_TYPE, rows))
+        rows = maker.trees(poses.times_ns, tree)
+        streams.append((TF_TOPIC, sensor_messages.TREE, rows))
     return [
         bag_writing.messages_of_topic(poses.times_ns, topic, type_, rows, present)
         for topic, type_, rows in streams
@@ -165,12 +166,16 @@ def _check_types(
 
     ROS 1 knows the transforms of /tf under an older name of their type, too.
     """
-    added = {TF_TOPIC: {TF_TYPE}} if options.add_tf and not options.drop_tf else {}
+    added = {TF_TOPIC: {sensor_messages.TREE}} if options.add_tf and not options.drop_tf else {}
     if kind is bag_writing.BagFormat.ROS1 and added:
         added[TF_TOPIC].add("tf/msg/tfMessage")
     if options.add_transform_stamped:
         names = ("T_G_I", "T_M_I", "T_G_M")
-        added |= {f"/{name}{entry.suffix}": {_TRANSFORM_TYPE} for name in names for entry in poses}
+        added |= {
+            f"/{name}{entry.suffix}": {sensor_messages.TRANSFORM}
+            for name in names
+            for entry in poses
+        }
     for topic, type_ in present:
         if topic in added and type_ not in added[topic]:
             remedy = "--rosbag_plugin_pose_to_bag_drop_tf or " if topic == TF_TOPIC else ""

@@ -1,21 +1,29 @@
-"""Images, calibrations and point clouds as serialised messages, and back."""
+"""Samples, poses, images, calibrations and point clouds as serialised messages, and clouds back."""
 
 from typing import Any
 
 import numpy as np
 
 from maplab_py.array_types import F64, I64, NDArray
-from maplab_py.errors import MapError
+from maplab_py.errors import MapError, UserError
+from maplab_py.geometry import so3
 from maplab_py.interop.ply import EmptyCloud, PlyCloud, cloud_of_table
 from maplab_py.interop.recordings.bag_files import message_types
 from maplab_py.sensors import Camera, Distortion, Projection
 
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO, CLOUD = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
-PATH = "nav_msgs/msg/Path"
+IMU, POSE = "sensor_msgs/msg/Imu", "geometry_msgs/msg/PoseStamped"
+TRANSFORM, TREE = "geometry_msgs/msg/TransformStamped", "tf2_msgs/msg/TFMessage"
+ODOMETRY, PATH = "nav_msgs/msg/Odometry", "nav_msgs/msg/Path"
 LINES = "visualization_msgs/msg/Marker"
 _LINE_LIST, _LINE_WIDTH_M = 5, 0.02
+_NAME = 2
+"""Kind of a field of the library rosbags: a message."""
 _S_TO_NS = 1_000_000_000
+_NONE, _UNKNOWN = np.zeros(3), np.zeros(36)
+_NOT_MEASURED = np.append(-1.0, np.zeros(8))
+"""Covariance of a quantity that is not measured (sensor_msgs/Imu)."""
 _ENCODINGS = {("uint8", 2): "mono8", ("uint8", 3): "bgr8", ("uint16", 2): "16UC1"}
 _DISTORTIONS = {
     Distortion.NONE: "plumb_bob",
@@ -49,7 +57,89 @@ class MessageMaker:
         Raises:
             UserError: The library is missing.
         """
-        self._is_ros_2, self._store = is_ros_2, message_types(is_ros_2=is_ros_2)
+        self._is_ros_2 = is_ros_2
+        self._store: Any = message_types(is_ros_2=is_ros_2)
+
+    def imu(self, times_ns: I64, accel_gyro: F64, frame: str) -> list[bytes]:
+        """Return sensor_msgs/Imu without orientation.
+
+        Args:
+            times_ns: Stamps (N,).
+            accel_gyro: Samples (N, 6) [ax ay az gx gy gz], m/s^2 and rad/s.
+            frame: Name of the frame.
+        """
+        turn, unknown = (0.0, 0.0, 0.0, 1.0), np.zeros(9)
+        return [
+            self._bytes(IMU, head, turn, _NOT_MEASURED, sample[3:], unknown, sample[:3], unknown)
+            for head, sample in zip(
+                self._headers(times_ns, frame), accel_gyro.tolist(), strict=True
+            )
+        ]
+
+    def poses(self, times_ns: I64, T_A_B: F64, frame: str) -> list[bytes]:
+        """Return geometry_msgs/PoseStamped of poses T_A_B (N, 7); the frame is A."""
+        return [self._bytes(POSE, *stamped) for stamped in self._stamped(times_ns, T_A_B, frame)]
+
+    def path(self, times_ns: I64, T_A_B: F64, frame: str) -> bytes:
+        """Return a nav_msgs/Path of poses T_A_B (N, 7), N > 0; the frame is A, the stamp the last time."""
+        poses = self._stamped(times_ns, T_A_B, frame)
+        return self._bytes(PATH, poses[-1][0], poses)
+
+    def transforms(self, times_ns: I64, T_A_B: F64, frames: tuple[str, str]) -> list[bytes]:
+        """Return geometry_msgs/TransformStamped of poses T_A_B (N, 7); the frames are A and B."""
+        return [
+            self._bytes(TRANSFORM, head, frames[1], pose)
+            for head, pose in self._stamped(times_ns, T_A_B, frames[0])
+        ]
+
+    def trees(self, times_ns: I64, transforms: list[tuple[F64, tuple[str, str]]]) -> list[bytes]:
+        """Return tf2_msgs/TFMessage, each with the transforms of a time.
+
+        Args:
+            times_ns: Stamps (N,).
+            transforms: Poses T_A_B (N, 7) with the names of the frames A and B.
+        """
+        columns = [
+            [(head, B, pose) for head, pose in self._stamped(times_ns, T_A_B, A)]
+            for T_A_B, (A, B) in transforms
+        ]
+        return [self._bytes(TREE, list(row)) for row in zip(*columns, strict=True)]
+
+    def odometry(
+        self,
+        times_ns: I64,
+        T_A_B: F64,
+        v_A: F64,
+        frames: tuple[str, str],
+        *,
+        w_B: F64 = _NONE,
+        pose_covariance: F64 = _UNKNOWN,
+        twist_covariance: F64 = _UNKNOWN,
+    ) -> list[bytes]:
+        """Return nav_msgs/Odometry; its twist is in B.
+
+        Args:
+            times_ns: Stamps (N,).
+            T_A_B: Poses (N, 7).
+            v_A: Velocities (N, 3) of B, in A [m/s].
+            frames: Names of A and B.
+            w_B: Angular velocity (3,) of B, in B [rad/s].
+            pose_covariance: (36,) of position and turn about the axes of A; 0 = unknown.
+            twist_covariance: (36,) of velocity and angular velocity in B; 0 = unknown.
+        """
+        v_B = so3.rotate(so3.inverse(T_A_B[:, :4]), v_A).tolist()
+        return [
+            self._bytes(
+                ODOMETRY,
+                head,
+                frames[1],
+                (pose, pose_covariance),
+                ((velocity, w_B.tolist()), twist_covariance),
+            )
+            for (head, pose), velocity in zip(
+                self._stamped(times_ns, T_A_B, frames[0]), v_B, strict=True
+            )
+        ]
 
     def image(self, stamp_ns: int, frame: str, pixels: NDArray[Any]) -> bytes:
         """Return an Image of pixels (H, W) 8 or 16 bits, or (H, W, 3) BGR."""
@@ -60,19 +150,6 @@ class MessageMaker:
         step = len(data) // height
         return self._bytes(IMAGE, header, height, width, encoding, 0, step, data)
 
-    def path(self, times_ns: I64, T_A_B: F64, frame: str) -> bytes:
-        """Return a nav_msgs/Path of poses T_A_B (N, 7), N > 0; the frame is A, the stamp the last time."""
-        types = self._store.types
-        point, quaternion, pose, stamped = (
-            types[f"geometry_msgs/msg/{name}"]
-            for name in ("Point", "Quaternion", "Pose", "PoseStamped")
-        )
-        poses = [
-            stamped(self._header(time_ns, frame), pose(point(*T[4:]), quaternion(*T[:4])))
-            for time_ns, T in zip(times_ns.tolist(), T_A_B.tolist(), strict=True)
-        ]
-        return self._bytes(PATH, self._header(int(times_ns[-1]), frame), poses)
-
     def lines(
         self,
         stamp_ns: int,
@@ -82,33 +159,11 @@ class MessageMaker:
         colour: tuple[float, float, float, float],
     ) -> bytes:
         """Return a Marker of ROS 2: lines between points (L, 2, 3), coloured (red, green, blue, alpha)."""
-        types = self._store.types
-        point, vector = types["geometry_msgs/msg/Point"], types["geometry_msgs/msg/Vector3"]
-        quaternion, pose = types["geometry_msgs/msg/Quaternion"], types["geometry_msgs/msg/Pose"]
-        time, colour_type = types["builtin_interfaces/msg/Time"], types["std_msgs/msg/ColorRGBA"]
-        none, nothing = np.zeros(0, dtype=np.uint8), types["std_msgs/msg/Header"](time(0, 0), "")
-        return self._bytes(
-            LINES,
-            self._header(stamp_ns, frame),
-            name,
-            0,
-            _LINE_LIST,
-            0,
-            pose(point(0.0, 0.0, 0.0), quaternion(0.0, 0.0, 0.0, 1.0)),
-            vector(_LINE_WIDTH_M, 0.0, 0.0),
-            colour_type(*colour),
-            types["builtin_interfaces/msg/Duration"](0, 0),
-            False,
-            [point(*p) for p in ends.reshape(-1, 3).tolist()],
-            [],
-            "",
-            types[COMPRESSED](nothing, "", none),
-            [],
-            "",
-            "",
-            types["visualization_msgs/msg/MeshFile"]("", none),
-            False,
-        )
+        none, nowhere = np.zeros(0, dtype=np.uint8), (_NONE.tolist(), (0.0, 0.0, 0.0, 1.0))
+        shape = (name, 0, _LINE_LIST, 0, nowhere, (_LINE_WIDTH_M, 0.0, 0.0), colour, (0, 0), False)
+        texture: tuple[Any, ...] = ("", (((0, 0), ""), "", none), [], "", "", ("", none), False)
+        points = ends.reshape(-1, 3).tolist()
+        return self._bytes(LINES, self._header(stamp_ns, frame), *shape, points, [], *texture)
 
     def camera_info(self, stamp_ns: int, frame: str, camera: Camera) -> bytes:
         """Return the CameraInfo of a pinhole camera; see `has_camera_info`."""
@@ -116,23 +171,13 @@ class MessageMaker:
         K = np.array([fu, 0.0, cu, 0.0, fv, cv, 0.0, 0.0, 1.0])
         P = np.array([fu, 0.0, cu, 0.0, 0.0, fv, cv, 0.0, 0.0, 0.0, 1.0, 0.0])
         D = np.array(camera.distortion_parameters, dtype=np.float64)
-        if _DISTORTIONS[camera.distortion] == "plumb_bob":
+        model = _DISTORTIONS[camera.distortion]
+        if model == "plumb_bob":
             D = np.concatenate([D, np.zeros(5 - len(D))])
-        region = self._store.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-        return self._bytes(
-            CAMERA_INFO,
-            self._header(stamp_ns, frame),
-            camera.height_px,
-            camera.width_px,
-            _DISTORTIONS[camera.distortion],
-            D,
-            K,
-            np.eye(3).reshape(-1),
-            P,
-            0,
-            0,
-            region,
-        )
+        size, region = (camera.height_px, camera.width_px), (0, 0, 0, 0, False)
+        matrices = (D, K, np.eye(3).reshape(-1), P)
+        header = self._header(stamp_ns, frame)
+        return self._bytes(CAMERA_INFO, header, *size, model, *matrices, 0, 0, region)
 
     def cloud(self, stamp_ns: int, frame: str, cloud: PlyCloud) -> bytes:
         """Return a PointCloud2 with the colours and intensities that there are.
@@ -140,47 +185,63 @@ class MessageMaker:
         Coordinates are floats of 32 bits, of 64 where these would round.
         """
         kind = "f4" if np.array_equal(cloud.p.astype(np.float32), cloud.p) else "f8"
-        fields = [(name, kind) for name in ("x", "y", "z")]
-        columns: list[NDArray[Any]] = [cloud.p[:, axis] for axis in range(3)]
-        if cloud.intensity is not None:
-            fields.append(("intensity", "f4"))
-            columns.append(cloud.intensity)
-        if cloud.colours is not None:
-            fields.append(("rgb", "f4"))  # a word of 32 bits, by convention called a float
-            red, green, blue = cloud.colours.T.astype(np.uint32)
-            columns.append(((red << 16) | (green << 8) | blue).view(np.float32))
-        table = np.zeros(len(cloud.p), dtype=[(name, f"<{kind}") for name, kind in fields])
-        for (name, _), values in zip(fields, columns, strict=True):
-            table[name] = values
-        point_field = self._store.types["sensor_msgs/msg/PointField"]
-        numbers = {"f4": _FLOAT32, "f8": _FLOAT64}
-        described = [
-            point_field(name, table.dtype.fields[name][1], numbers[kind], 1)  # type: ignore[index]
-            for name, kind in fields
+        columns: list[tuple[str, str, NDArray[Any]]] = [
+            (name, kind, cloud.p[:, axis]) for axis, name in enumerate("xyz")
         ]
-        return self._bytes(
-            CLOUD,
-            self._header(stamp_ns, frame),
-            1,
-            len(table),
-            described,
-            False,
-            table.itemsize,
-            table.nbytes,
-            table.view(np.uint8).reshape(-1),
-            True,
-        )
+        if cloud.intensity is not None:
+            columns.append(("intensity", "f4", cloud.intensity))
+        if cloud.colours is not None:  # a word of 32 bits, by convention called a float
+            red, green, blue = cloud.colours.T.astype(np.uint32)
+            word = ((red << 16) | (green << 8) | blue).view(np.float32)
+            columns.append(("rgb", "f4", word))
+        table = np.zeros(len(cloud.p), dtype=[(name, f"<{kind}") for name, kind, _ in columns])
+        for name, _, values in columns:
+            table[name] = values
+        numbers = {"f4": _FLOAT32, "f8": _FLOAT64}
+        fields = [
+            (name, table.dtype.fields[name][1], numbers[kind], 1)  # type: ignore[index]
+            for name, kind, _ in columns
+        ]
+        layout = (1, len(table), fields, False, table.itemsize, table.nbytes)
+        data = table.view(np.uint8).reshape(-1)
+        return self._bytes(CLOUD, self._header(stamp_ns, frame), *layout, data, True)
+
+    def _stamped(self, times_ns: I64, T_A_B: F64, frame: str) -> list[tuple[Any, Any]]:
+        """Return headers and poses."""
+        poses = [(row[4:], row[:4]) for row in T_A_B.tolist()]
+        return list(zip(self._headers(times_ns, frame), poses, strict=True))
+
+    def _headers(self, times_ns: I64, frame: str) -> list[Any]:
+        return [self._header(time_ns, frame) for time_ns in times_ns.tolist()]
 
     def _header(self, stamp_ns: int, frame: str) -> Any:
-        types = self._store.types
-        time = types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, _S_TO_NS))
-        header = types["std_msgs/msg/Header"]
-        return header(time, frame) if self._is_ros_2 else header(0, time, frame)
+        """Return a std_msgs/Header.
+
+        Raises:
+            UserError: The time is before 1970, or after what the messages can hold.
+        """
+        time = divmod(stamp_ns, _S_TO_NS)
+        last = np.iinfo(np.int32).max if self._is_ros_2 else np.iinfo(np.uint32).max
+        if not 0 <= time[0] <= last:
+            raise UserError(
+                f"the time {stamp_ns} ns cannot be written into a bag: stamps go from 0 to {last} s; move "
+                "the stamps of the map"
+            )
+        return (time, frame) if self._is_ros_2 else (0, time, frame)
 
     def _bytes(self, kind: str, *fields: Any) -> bytes:
-        message = self._store.types[kind](*fields)
         write = self._store.serialize_cdr if self._is_ros_2 else self._store.serialize_ros1
-        return bytes(write(message, kind))
+        return bytes(write(self._message(kind, fields), kind))
+
+    def _message(self, kind: str, fields: Any) -> Any:
+        """Return a message of its fields, in which a sequence stands for a message, or a list for several."""
+        parts = list(fields)
+        for place, (_, (node, content)) in enumerate(self._store.fielddefs[kind][1]):
+            if node == _NAME:
+                parts[place] = self._message(content, parts[place])
+            elif isinstance(parts[place], list):
+                parts[place] = [self._message(content[0][1], part) for part in parts[place]]
+        return self._store.types[kind](*parts)
 
 
 def has_camera_info(camera: Camera) -> bool:

@@ -16,7 +16,7 @@ from urllib.parse import urlsplit
 from maplab_py.errors import UserError
 from maplab_py.interop.live import options, transport
 from maplab_py.interop.recordings.bag_files import message_types
-from maplab_py.interop.recordings.bag_layouts import full_type
+from maplab_py.interop.recordings.bag_kinds import full_type
 
 SUBPROTOCOLS: Any = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 """Those of foxglove_bridge from 3.0 on, and before."""

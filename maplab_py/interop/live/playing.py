@@ -9,7 +9,7 @@ from maplab_py.interop.bags.sensor_messages import IMAGE, MessageMaker
 from maplab_py.interop.live.connection import open_transport
 from maplab_py.interop.live.options import NetworkOptions
 from maplab_py.interop.live.transport import LOOK_EVERY_S, Publish, Transport
-from maplab_py.interop.recordings import bag_layouts, bags
+from maplab_py.interop.recordings import bags
 from maplab_py.interop.recordings.protocol import CameraImage, ImuBatch, Recording
 from maplab_py.options import Options, option
 from maplab_py.progress import SILENT, Progress
@@ -175,8 +175,7 @@ class _Player:
 
     def _samples(self, batch: ImuBatch) -> Iterator[tuple[int, int, Callable[[], bytes]]]:
         stamps_ns = batch.times_ns + self._clock_offset_ns(batch.time_ns)
-        is_ros_2 = self._transport.is_ros_2
-        rows = bag_layouts.imu_messages(stamps_ns, batch.accel_gyro, "imu", is_ros_2=is_ros_2)
+        rows = self._maker.imu(stamps_ns, batch.accel_gyro, "imu")
         for time_ns, row in zip(batch.times_ns.tolist(), rows, strict=True):
             yield time_ns, -1, lambda data=row: data  # type: ignore[misc]
 

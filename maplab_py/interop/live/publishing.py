@@ -6,15 +6,13 @@ import numpy as np
 
 from maplab_py.array_types import F64
 from maplab_py.geometry import se3, so3
-from maplab_py.interop.bags.poses import TF_TOPIC, TF_TYPE
-from maplab_py.interop.bags.sensor_messages import CLOUD, MessageMaker
+from maplab_py.interop.bags import sensor_messages
+from maplab_py.interop.bags.poses import TF_TOPIC
 from maplab_py.interop.live.options import LiveOptions
 from maplab_py.interop.live.transport import Transport
 from maplab_py.interop.ply import PlyCloud
-from maplab_py.interop.recordings import bag_layouts
 
-ODOMETRY_TOPIC, ODOMETRY_TYPE = "/maplab/odometry", "nav_msgs/msg/Odometry"
-POSE_TOPIC, POSE_TYPE = "/maplab/pose_in_map", "geometry_msgs/msg/PoseStamped"
+ODOMETRY_TOPIC, POSE_TOPIC = "/maplab/odometry", "/maplab/pose_in_map"
 LANDMARKS_TOPIC = "/maplab/landmarks"
 
 
@@ -34,26 +32,25 @@ class PosePublisher:
     """Publishes estimates as odometry, pose in the map and transforms."""
 
     def __init__(self, transport: Transport, options: LiveOptions) -> None:
-        self._options, self._is_ros_2 = options, transport.is_ros_2
-        self._odometry = transport.advertise(ODOMETRY_TOPIC, ODOMETRY_TYPE)
-        self._pose = transport.advertise(POSE_TOPIC, POSE_TYPE)
-        self._transforms = transport.advertise(TF_TOPIC, TF_TYPE)
+        self._options = options
+        self._maker = sensor_messages.MessageMaker(is_ros_2=transport.is_ros_2)
+        self._odometry = transport.advertise(ODOMETRY_TOPIC, sensor_messages.ODOMETRY)
+        self._pose = transport.advertise(POSE_TOPIC, sensor_messages.POSE)
+        self._transforms = transport.advertise(TF_TOPIC, sensor_messages.TREE)
         if options.publish_landmarks:
-            self._landmarks = transport.advertise(LANDMARKS_TOPIC, CLOUD)
-            self._maker = MessageMaker(is_ros_2=transport.is_ros_2)
+            self._landmarks = transport.advertise(LANDMARKS_TOPIC, sensor_messages.CLOUD)
 
     def publish(self, estimate: Estimate) -> None:
         """Publish a state."""
-        options, is_ros_2 = self._options, self._is_ros_2
+        options, maker = self._options, self._maker
         times_ns = np.array([estimate.time_ns])
         T_M_I = estimate.T_M_I[None]
         pose_covariance, twist_covariance = ros_covariances(estimate)
-        odometry = bag_layouts.odometry_messages(
+        odometry = maker.odometry(
             times_ns,
             T_M_I,
             estimate.v_M_I[None],
             (options.odom_frame, options.base_frame),
-            is_ros_2=is_ros_2,
             w_B=estimate.w_I,
             pose_covariance=pose_covariance.reshape(36),
             twist_covariance=twist_covariance.reshape(36),
@@ -64,11 +61,9 @@ class PosePublisher:
             T_G_M = estimate.T_G_M[None]
             transforms.insert(0, (T_G_M, (options.world_frame, options.odom_frame)))
             T_G_I = se3.compose(T_G_M, T_M_I)
-            poses = bag_layouts.pose_messages(
-                times_ns, T_G_I, options.world_frame, is_ros_2=is_ros_2
-            )
+            poses = maker.poses(times_ns, T_G_I, options.world_frame)
             self._pose(poses[0])
-        self._transforms(bag_layouts.tf_messages(times_ns, transforms, is_ros_2=is_ros_2)[0])
+        self._transforms(maker.trees(times_ns, transforms)[0])
 
     def publish_landmarks(self, time_ns: int, p_M: F64) -> None:
         """Publish landmarks (L, 3), if the user wants them."""

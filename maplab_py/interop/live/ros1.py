@@ -20,7 +20,7 @@ from maplab_py.errors import MaplabError, UserError
 from maplab_py.interop.live import transport as transports
 from maplab_py.interop.live.options import NetworkOptions
 from maplab_py.interop.recordings.bag_files import message_types
-from maplab_py.interop.recordings.bag_layouts import full_type
+from maplab_py.interop.recordings.bag_kinds import full_type
 
 # Source: wiki.ros.org, "ROS/TCPROS", "ROS/Connection Header"
 

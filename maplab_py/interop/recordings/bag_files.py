@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from maplab_py.errors import MapError, MaplabError, UserError
 from maplab_py.input_files import read_text
-from maplab_py.interop.recordings import bag_layouts, clocks
+from maplab_py.interop.recordings import bag_kinds, clocks
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -287,7 +287,7 @@ def _check_databases(path: Path) -> None:
     for file in files:
         with file.open("rb") as stream:
             header = stream.read(_SQLITE_HEADER)
-        if len(header) < _SQLITE_HEADER or not header.startswith(bag_layouts.SQLITE):
+        if len(header) < _SQLITE_HEADER or not header.startswith(bag_kinds.SQLITE):
             continue  # no database: the library knows what it is
         page_bytes, pages = struct.unpack_from(">H", header, 16)[0], _number(header, 28)
         page_bytes = 65536 if page_bytes == 1 else page_bytes

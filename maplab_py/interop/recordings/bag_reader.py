@@ -28,7 +28,7 @@ from rosbags.typesys.store import Typestore
 
 from maplab_py.atomic import replaced_file
 from maplab_py.errors import MapError
-from maplab_py.interop.recordings.bag_layouts import full_type, storage_kind
+from maplab_py.interop.recordings.bag_kinds import full_type, storage_kind
 
 if sys.version_info >= (3, 14):
     from compression import zstd

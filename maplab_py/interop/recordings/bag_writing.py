@@ -18,7 +18,7 @@ from maplab_py.array_types import I64
 from maplab_py.cancellation import check_cancelled, cleaned_up
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.recordings.bag_files import all_messages, message_types
-from maplab_py.interop.recordings.bag_layouts import storage_kind
+from maplab_py.interop.recordings.bag_kinds import storage_kind
 from maplab_py.output_files import check_writable, copy_file
 from maplab_py.progress import Progress
 

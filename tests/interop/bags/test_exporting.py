@@ -15,7 +15,7 @@ from maplab_py.interop.bags import listing, sensor_messages
 from maplab_py.interop.bags.exporting import export_bag, export_mcap
 from maplab_py.interop.bags.options import BagExportOptions, PoseToBagOptions
 from maplab_py.interop.bags.poses import add_poses_to_bag, pose_times
-from maplab_py.interop.recordings import bag_layouts, bag_writing, map_replay, reader_choice, stream
+from maplab_py.interop.recordings import bag_writing, map_replay, reader_choice, stream
 from maplab_py.interop.recordings.bag_files import opened_bag
 from maplab_py.interop.recordings.options import SourceOptions
 from maplab_py.interop.vertex_states import poses_at
@@ -316,7 +316,7 @@ def test_wrong_bags_are_refused(tmp_path: Path) -> None:
     refused("unindexed.bag: the bag cannot be read .*reindex", MapError, source=unindexed)
     wrong = tmp_path / "wrong.bag"
     times_ns = np.array([10, 20])
-    rows = bag_layouts.pose_messages(times_ns, se3.identity(2), "map", is_ros_2=False)
+    rows = sensor_messages.MessageMaker(is_ros_2=False).poses(times_ns, se3.identity(2), "map")
     kind = "geometry_msgs/msg/PoseStamped"
     bag_writing.write_bag(
         wrong,

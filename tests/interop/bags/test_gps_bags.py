@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from maplab_py.errors import MapError, UserError
+from maplab_py.interop.bags.sensor_messages import MessageMaker
 from maplab_py.interop.gps import NAV_SAT_FIX, read_fixes
 from maplab_py.interop.recordings.bag_files import message_types
-from maplab_py.interop.recordings.bag_layouts import imu_messages
 from maplab_py.interop.recordings.bag_writing import (
     BagFormat,
     BagMessage,
@@ -60,7 +60,7 @@ def write_fixes(
     messages = [
         m for topic in topics for m in messages_of_topic(arrival_ns, topic, NAV_SAT_FIX, rows)
     ]
-    samples = imu_messages(TIMES_NS, np.zeros((COUNT, 6)), "imu", is_ros_2=kind.is_ros_2)
+    samples = MessageMaker(is_ros_2=kind.is_ros_2).imu(TIMES_NS, np.zeros((COUNT, 6)), "imu")
     imu = Channel("/imu", "sensor_msgs/msg/Imu")
     messages += [BagMessage(t, imu, m) for t, m in zip(TIMES_NS.tolist(), samples, strict=True)]
     write_bag(path, kind, sorted(messages, key=lambda message: message.time_ns))

@@ -15,7 +15,7 @@ from maplab_py.interop.calibration_import import import_calibration, read_calibr
 from maplab_py.interop.live.options import LiveOptions
 from maplab_py.interop.live.source import LiveRecording
 from maplab_py.interop.live.transport import Publish, Take, Topic
-from maplab_py.interop.recordings import bag_layouts, protocol
+from maplab_py.interop.recordings import protocol
 from maplab_py.interop.recordings.options import SourceOptions
 from tests.interop.recordings.written import Content, make_content, write_calibration, write_folder
 
@@ -73,7 +73,7 @@ def gravity(content: Content) -> Content:
 def messages_of(content: Content, *, is_ros_2: bool = True) -> list[tuple[int, str, bytes]]:
     """Return (stamp_ns, topic, message) in the order of the stamps."""
     maker = MessageMaker(is_ros_2=is_ros_2)
-    imu = bag_layouts.imu_messages(content.imu_ns, content.accel_gyro, "imu", is_ros_2=is_ros_2)
+    imu = maker.imu(content.imu_ns, content.accel_gyro, "imu")
     messages = [(int(t), "/imu0", m) for t, m in zip(content.imu_ns, imu, strict=True)]
     for camera, (stamps_ns, images) in enumerate(
         zip(content.stamps_ns, content.images, strict=True)
@@ -167,4 +167,4 @@ def small_master(port: int = 0) -> Iterator[SmallMaster]:
 def imu_message(stamp_ns: int, *, is_ros_2: bool, accel: float = 9.81) -> bytes:
     """Return a message of an IMU at rest."""
     samples = np.array([[0.0, 0.0, accel, 0.0, 0.0, 0.0]])
-    return bag_layouts.imu_messages(np.array([stamp_ns]), samples, "imu", is_ros_2=is_ros_2)[0]
+    return MessageMaker(is_ros_2=is_ros_2).imu(np.array([stamp_ns]), samples, "imu")[0]

@@ -9,12 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 
 from maplab_py.errors import MapError, UserError
-from maplab_py.interop.recordings import bag_layouts
+from maplab_py.interop.bags.sensor_messages import IMU, POSE, TRANSFORM, TREE, MessageMaker
 from maplab_py.interop.recordings.bag_files import message_types, opened_bag
 from maplab_py.interop.recordings.bag_writing import (
     BagFormat,
@@ -28,79 +25,44 @@ from maplab_py.interop.recordings.bag_writing import (
     write_bag,
 )
 from maplab_py.output_files import planning
-from tests.interop.recordings.written import header, imu_message
 
 pytest.importorskip("rosbags")
 
-IMU = "sensor_msgs/msg/Imu"
 FORMATS = list(BagFormat)
-ANY_FLOAT = st.floats(allow_nan=True, allow_infinity=True, width=64)
-FRAMES = st.text(st.characters(codec="utf-8", exclude_characters="\x00"), max_size=9)
 
 
 def named(folder: Path, kind: BagFormat) -> Path:
     return folder / ("walk" if kind.is_ros_2 else "walk.bag")
 
 
-@st.composite
-def samples(draw: Any, columns: int) -> tuple[np.ndarray, np.ndarray]:
-    count = draw(st.integers(1, 5))
-    stamps = st.integers(0, 2_147_483_647_999_999_999)
-    times_ns = np.array(sorted(draw(st.lists(stamps, min_size=count, max_size=count))))
-    return times_ns, draw(arrays(np.float64, (count, columns), elements=ANY_FLOAT))
-
-
-def serialised(store: Any, message: Any, is_ros_2: bool) -> bytes:
-    write = store.serialize_cdr if is_ros_2 else store.serialize_ros1
-    return bytes(write(message, message.__msgtype__))
-
-
 @pytest.mark.parametrize("is_ros_2", [False, True])
-@given(data=samples(6), frame=FRAMES)
-def test_imu_messages_are_those_of_rosbags(
-    is_ros_2: bool, data: tuple[np.ndarray, np.ndarray], frame: str
-) -> None:
-    store = message_types(is_ros_2=is_ros_2)
-    times_ns, values = data
-    rows = bag_layouts.imu_messages(times_ns, values, frame, is_ros_2=is_ros_2)
-    for row, time_ns, sample in zip(rows, times_ns.tolist(), values, strict=True):
-        message = imu_message(store, time_ns, sample, 2 if is_ros_2 else 1)
-        message.header.frame_id = frame
-        message.orientation_covariance = np.array([-1.0, *[0.0] * 8])
-        assert row == serialised(store, message, is_ros_2)
-
-
-@pytest.mark.parametrize("is_ros_2", [False, True])
-@given(data=samples(7), frames=st.tuples(FRAMES, FRAMES))
-def test_poses_are_those_of_rosbags(
-    is_ros_2: bool, data: tuple[np.ndarray, np.ndarray], frames: tuple[str, str]
-) -> None:
-    store, (times_ns, T_A_B) = message_types(is_ros_2=is_ros_2), data
-    types = store.types
-    poses = bag_layouts.pose_messages(times_ns, T_A_B, frames[0], is_ros_2=is_ros_2)
-    transforms = bag_layouts.transform_messages(times_ns, T_A_B, frames, is_ros_2=is_ros_2)
-    both = [(T_A_B, frames), (T_A_B[::-1], (frames[1], frames[0]))]
-    trees = bag_layouts.tf_messages(times_ns, both, is_ros_2=is_ros_2)
-
-    def stamped(row: int, T: np.ndarray, parent: str, child: str) -> Any:
-        turn = types["geometry_msgs/msg/Quaternion"](*T[:4].tolist())
-        shift = types["geometry_msgs/msg/Vector3"](*T[4:].tolist())
-        head = header(store, int(times_ns[row]), 2 if is_ros_2 else 1)
-        head.frame_id = parent
-        transform = types["geometry_msgs/msg/Transform"](shift, turn)
-        return types["geometry_msgs/msg/TransformStamped"](head, child, transform)
-
-    for row in range(len(times_ns)):
-        first = stamped(row, T_A_B[row], *frames)
-        second = stamped(row, T_A_B[::-1][row], frames[1], frames[0])
-        assert transforms[row] == serialised(store, first, is_ros_2)
-        tree = types["tf2_msgs/msg/TFMessage"]([first, second])
-        assert trees[row] == serialised(store, tree, is_ros_2)
-        transform = first.transform
-        point = types["geometry_msgs/msg/Point"](*T_A_B[row, 4:].tolist())
-        pose = types["geometry_msgs/msg/Pose"](point, transform.rotation)
-        message = types["geometry_msgs/msg/PoseStamped"](first.header, pose)
-        assert poses[row] == serialised(store, message, is_ros_2)
+def test_fields_are_in_their_places(is_ros_2: bool) -> None:
+    maker, store = MessageMaker(is_ros_2=is_ros_2), message_types(is_ros_2=is_ros_2)
+    read: Any = store.deserialize_cdr if is_ros_2 else store.deserialize_ros1
+    times_ns, values = np.array([7, 3_000_000_001]), np.arange(14.0).reshape(2, 7)
+    sample = read(maker.imu(times_ns, values[:, :6], "imü")[1], IMU)
+    assert (sample.header.frame_id, sample.header.stamp.sec, sample.header.stamp.nanosec) == (
+        "imü",
+        3,
+        1,
+    )
+    a, w = sample.linear_acceleration, sample.angular_velocity
+    assert [a.x, a.y, a.z, w.x, w.y, w.z] == values[1, :6].tolist()
+    assert sample.orientation_covariance.tolist() == [-1.0, *[0.0] * 8]
+    stamped = read(maker.poses(times_ns, values, "map")[1], POSE)
+    p, q = stamped.pose.position, stamped.pose.orientation
+    assert [q.x, q.y, q.z, q.w, p.x, p.y, p.z] == values[1].tolist()
+    both = [(values, ("map", "odom")), (values[::-1], ("odom", "imu"))]
+    first, second = read(maker.trees(times_ns, both)[1], TREE).transforms
+    assert (first.header.frame_id, first.child_frame_id) == ("map", "odom")
+    assert (second.header.frame_id, second.child_frame_id) == ("odom", "imu")
+    assert (first.transform.rotation.w, second.transform.translation.z) == (
+        values[1, 3],
+        values[0, 6],
+    )
+    single = read(maker.transforms(times_ns, values, ("map", "odom"))[1], TRANSFORM)
+    assert (single.header, single.child_frame_id) == (first.header, "odom")
+    assert single.transform == first.transform
 
 
 @pytest.mark.parametrize("is_ros_2", [False, True])
@@ -109,10 +71,10 @@ def test_odometry_has_the_velocity_of_the_body(is_ros_2: bool) -> None:
     half = np.sqrt(0.5)
     T_M_I = np.array([[0.0, 0.0, half, half, 1.0, 2.0, 3.0]])  # turned left by 90 degrees
     v_M = np.array([[0.0, 2.0, 0.5]])
-    (row,) = bag_layouts.odometry_messages(
-        np.array([3_000_000_001]), T_M_I, v_M, ("mission", "imu"), is_ros_2=is_ros_2
+    (row,) = MessageMaker(is_ros_2=is_ros_2).odometry(
+        np.array([3_000_000_001]), T_M_I, v_M, ("mission", "imu")
     )
-    read = store.deserialize_cdr if is_ros_2 else store.deserialize_ros1
+    read: Any = store.deserialize_cdr if is_ros_2 else store.deserialize_ros1
     message = read(row, "nav_msgs/msg/Odometry")
     assert (message.header.frame_id, message.child_frame_id) == ("mission", "imu")
     assert (message.header.stamp.sec, message.header.stamp.nanosec) == (3, 1)
@@ -126,7 +88,7 @@ def test_20_000_imu_messages_read_back_to_the_last_bit(tmp_path: Path, kind: Bag
     rng = np.random.default_rng(3)
     times_ns = 1_403_715_273_262_142_976 + np.cumsum(rng.integers(1, 10_000_000, 20_000))
     values = rng.normal(size=(20_000, 6)) * 10.0 ** rng.integers(-300, 300, (20_000, 6))
-    rows = bag_layouts.imu_messages(times_ns, values, "imu", is_ros_2=kind.is_ros_2)
+    rows = MessageMaker(is_ros_2=kind.is_ros_2).imu(times_ns, values, "imu")
     path = named(tmp_path, kind)
     counts = write_bag(path, kind, messages_of_topic(times_ns, "/imu0", IMU, rows))
     assert counts == {"/imu0": 20_000}
@@ -142,7 +104,7 @@ def test_20_000_imu_messages_read_back_to_the_last_bit(tmp_path: Path, kind: Bag
 
 def few(kind: BagFormat, topic: str = "/imu0", start: int = 10) -> Iterator[BagMessage]:
     times_ns = np.arange(start, start + 40, 10)
-    rows = bag_layouts.imu_messages(times_ns, np.ones((4, 6)), "imu", is_ros_2=kind.is_ros_2)
+    rows = MessageMaker(is_ros_2=kind.is_ros_2).imu(times_ns, np.ones((4, 6)), "imu")
     return messages_of_topic(times_ns, topic, IMU, rows)
 
 
@@ -215,7 +177,7 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:
         write_bag(tmp_path / "walk", BagFormat.SQLITE3, unknown)
     for time_ns in (-1, 2**31 * 1_000_000_000):
         with pytest.raises(UserError, match="cannot be written into a bag"):
-            bag_layouts.imu_messages(np.array([time_ns]), np.ones((1, 6)), "imu", is_ros_2=True)
+            MessageMaker(is_ros_2=True).imu(np.array([time_ns]), np.ones((1, 6)), "imu")
     assert list(tmp_path.iterdir()) == []
 
 
