@@ -59,7 +59,7 @@ def option(
 
 @dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))
 class Options:
-    """Base of option groups: makes each a frozen dataclass, and checks the ranges of its values."""
+    """Base of option groups: makes each a frozen dataclass, and checks its values."""
 
     flag_prefix: ClassVar[str] = ""
     __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
@@ -71,16 +71,20 @@ class Options:
         dataclasses.dataclass(frozen=True)(cls)
 
     def __post_init__(self) -> None:
-        """Check the ranges.
+        """Check ranges and choices; a group with more to check does so, too.
 
         Raises:
-            FlagError: A value is out of its range.
+            FlagError: A value is out of its range, or none of its choices.
         """
         for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            if said := violation(value, field.metadata.get("bounds", {})):
+            value, choices = getattr(self, field.name), field.metadata.get("choices", ())
+            said = violation(value, field.metadata.get("bounds", {}))
+            if choices and value not in choices:
+                said = f"must be one of {', '.join(filter(None, choices))}"
+            if said:
                 name = field.metadata["flag"] or self.flag_prefix + field.name
-                raise FlagError(f"--{name}={value:g}: {said}")
+                text = value if isinstance(value, str) else f"{value:g}"
+                raise FlagError(f"--{name}={text}: {said}")
 
 
 def violation(value: Any, bounds: Mapping[str, float]) -> str:

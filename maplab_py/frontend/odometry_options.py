@@ -100,11 +100,6 @@ class OdometryOptions(Options, prefix="vio_"):
         return () if self.estimated == ("time_offset",) else self.estimated
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            FlagError: A value is out of its range.
-        """
         super().__post_init__()
         for name in self.estimated:
             if name not in CALIBRATED:

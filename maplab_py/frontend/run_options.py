@@ -60,11 +60,6 @@ class OutputOptions(Options):
     at their time; needs --vio_localization_map_folder"""
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            FlagError: Options contradict each other, or the share is not in [0, 1].
-        """
         super().__post_init__()
         share = self.localization_map_keep_landmark_fraction
         if share and not self.optimize_map_to_localization_map:
@@ -98,11 +93,6 @@ class RunOptions(Options):
     """Print speed, uncertainty and biases every second"""
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            FlagError: A value is out of its range, or options contradict each other.
-        """
         super().__post_init__()
         is_localized = self.localization.map_folder is not None
         if self.output.export_localized_poses_to_csv is not None and not is_localized:

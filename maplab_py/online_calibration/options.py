@@ -58,11 +58,6 @@ class OnlineCalibrationOptions(Options, prefix="sc_"):
     wanted: WantedSigmas = WantedSigmas()
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            FlagError: Options contradict each other.
-        """
         super().__post_init__()
         if self.is_on and self.database is None:
             raise FlagError("--self_calibrate needs the device's --sc_database=FILE")

@@ -28,11 +28,6 @@ class PipelineOptions(Options):
     """Threads of a task; 0 = its share of the processors."""
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            FlagError: A value is out of range, or two contradict each other.
-        """
         super().__post_init__()
         self.local_workers()
         if self.resume and self.restart:

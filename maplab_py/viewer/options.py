@@ -117,10 +117,7 @@ class VisualizationOptions(Options, prefix="vis_"):
                 f"--vis_refused_closures_reason={reason}: no reason contains this text (there are: {known})"
             )
         if self.show_only_landmark_type:
-            try:
-                type_of_name(self.show_only_landmark_type)
-            except FlagError as error:
-                raise FlagError(f"--vis_show_only_landmark_type: {error}") from None
+            type_of_name(self.show_only_landmark_type, "vis_show_only_landmark_type")
 
     @property
     def landmark_colouring(self) -> str:

@@ -111,18 +111,19 @@ def type_name(feature_type: int) -> str:
     return _NAMES.get(feature_type, f"type {feature_type}")
 
 
-def type_of_name(name: str) -> int:
+def type_of_name(name: str, flag: str = "") -> int:
     """Return the feature type that maplab calls so; its number is a name, too.
 
     Raises:
-        FlagError: There is no such type.
+        FlagError: There is no such type; the message names the flag, if one is given.
     """
     for feature_type, known in _NAMES.items():
         if name.lower() == known.lower():
             return feature_type
     if name.isdigit() and int(name) < 2**31:
         return int(name)
-    raise FlagError(f"{name} is no feature type: wants one of {', '.join(TYPE_NAMES)}, or a number")
+    said = f"{name} is no feature type: wants one of {', '.join(TYPE_NAMES)}, or a number"
+    raise FlagError(f"--{flag}: {said}" if flag else said)
 
 
 _NAMES: dict[int, str] = {

@@ -148,7 +148,7 @@ def refuse() -> SaveReport:
         ({"datasource_folder": "images", "camera_topics": "/a,/b"}, "apply to bags only"),
         (
             {"datasource_folder": "images", "feature_tracking_descriptor_type": "freak"},
-            "FREAK is not in the OpenCV",
+            "must be one of brisk, xfeat",
         ),
         (
             {"datasource_folder": "images", "feature_tracking_descriptor_type": "xfeat"},

@@ -54,11 +54,6 @@ class CloudClosureOptions(Options, prefix="lidar_lc_"):
     """Variance of the prior of an edge's switch variable at 1"""
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            FlagError: A value is out of range, or two options exclude each other.
-        """
         super().__post_init__()
         if self.search_globally and self.from_closures:
             raise FlagError("--lidar_lc_global and --lidar_lc_from_closures exclude each other")

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from maplab_py.algorithms.evaluation import plausibility, pose_errors, reports
-from maplab_py.algorithms.evaluation.options import DELTA_UNITS, TrajectoryEvaluationOptions
+from maplab_py.algorithms.evaluation.options import TrajectoryEvaluationOptions
 from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import interpolation, se3, so3
@@ -228,8 +228,6 @@ def _relative(
     """Return statistics of the relative errors [m], [deg] of segments within missions."""
     mission = vi_map.vertices.mission[rows]
     times_s = (vi_map.vertices.timestamp_ns[rows] - vi_map.vertices.timestamp_ns[rows].min()) * 1e-9
-    if options.rpe_delta_unit not in DELTA_UNITS:
-        raise EstimationError(f"--rpe_delta_unit must be one of {', '.join(DELTA_UNITS)}")
     parts = []
     for members in _groups(mission):
         if options.rpe_delta_unit == "frames":

@@ -68,11 +68,6 @@ class GpsOptions(Options, prefix="gps_"):
     """Replace the absolute poses that the mission has"""
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            FlagError: A value is out of range, or a list of numbers is none.
-        """
         super().__post_init__()
         _ = self.lever_arm, self.given_origin
 
@@ -123,11 +118,6 @@ class WheelOptions(Options, prefix="wheel_"):
     """Replace the wheel odometry edges that the mission has"""
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            FlagError: A value is out of range, or the mounting is none.
-        """
         super().__post_init__()
         _ = self.T_I_S
 

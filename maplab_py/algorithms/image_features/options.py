@@ -71,10 +71,7 @@ class FeatureTrackOptions(Options, prefix="track_"):
             return kind.feature_type, (kind.size,)
         if self.feature_type.startswith(PLUGIN):
             return plugin_extractor(self.feature_type.removeprefix(PLUGIN)).feature_type, ()
-        try:
-            return type_of_name(self.feature_type), ()
-        except FlagError as error:
-            raise FlagError(f"--feature_type: {error}") from None
+        return type_of_name(self.feature_type, "feature_type"), ()
 
 
 @dataclasses.dataclass(frozen=True)

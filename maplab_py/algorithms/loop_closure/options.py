@@ -27,10 +27,7 @@ class FeatureTypeOptions(Options, prefix="lc_"):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        try:
-            type_of_name(self.feature_type)
-        except FlagError as error:
-            raise FlagError(f"--lc_feature_type: {error}") from None
+        type_of_name(self.feature_type, "lc_feature_type")
 
     @property
     def type_number(self) -> int:
@@ -135,11 +132,6 @@ class LoopClosureOptions(FeatureTypeOptions):
         return _INLIER_FACTORS.get(self.type_number, 1.0)
 
     def __post_init__(self) -> None:
-        """Check that matcher and type fit.
-
-        Raises:
-            FlagError: They do not.
-        """
         super().__post_init__()
         if self.matcher == "lighterglue" and self.type_number != FeatureType.XFEAT:
             raise FlagError(

@@ -105,11 +105,6 @@ class SelfCalibrationOptions(Options, prefix="sc_"):
     """Prior deviation of the velocity at the beginning of a run of segments."""
 
     def __post_init__(self) -> None:
-        """Check ranges and names.
-
-        Raises:
-            UserError: A number is out of its range, or a name is unknown; the message names the flag.
-        """
         super().__post_init__()
         self.grouping()
 

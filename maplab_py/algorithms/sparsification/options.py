@@ -2,7 +2,6 @@
 
 import dataclasses
 
-from maplab_py.errors import FlagError
 from maplab_py.options import Options, option
 from maplab_py.report import Report
 
@@ -31,11 +30,6 @@ class SparsificationOptions(Options, prefix="sparsification_"):
     """Largest number of landmarks of a part; larger maps are split along the co-visibility graph"""
     seed: int = option(0, ge=0)
     """Seed of the random choice."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.method not in METHODS:
-            raise FlagError(f"--sparsification_method={self.method}: one of {', '.join(METHODS)}")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -46,13 +46,9 @@ class DataOptions(Options):
     """Altitude that goes with --ba_latitude."""
 
     def __post_init__(self) -> None:
-        """Check the limits of thinning and the feature type."""
         super().__post_init__()
         if self.feature_type:
-            try:
-                type_of_name(self.feature_type)
-            except FlagError as error:
-                raise FlagError(f"--ba_feature_type: {error}") from None
+            type_of_name(self.feature_type, "ba_feature_type")
         if self.max_observations_per_landmark == 1:
             raise FlagError(
                 "--ba_max_observations_per_landmark must be at least 2: one observation does not "

@@ -65,11 +65,6 @@ class InitializationOptions(Options, prefix="vio_initialization_"):
     """Noise of the accelerometer, if the calibration says less"""
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            FlagError: A number is not positive, or the longest time is too short.
-        """
         super().__post_init__()
         for name in ("rest_s", "min_rig_s", "min_mono_s"):
             if getattr(self, name) > self.longest_s:

@@ -12,7 +12,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.distinct import distinct
-from maplab_py.errors import FlagError, UserError
+from maplab_py.errors import UserError
 from maplab_py.geometry import se3
 from maplab_py.interop.colmap import binary, child, child_process, undistortion
 from maplab_py.interop.colmap import model as colmap
@@ -93,10 +93,7 @@ def _of_type(vi_map: VIMap, name: str) -> VIMap:
     Raises:
         UserError: It has none, or there is no such type.
     """
-    try:
-        feature_type = type_of_name(name)
-    except FlagError as error:
-        raise FlagError(f"--colmap_feature_type: {error}") from None
+    feature_type = type_of_name(name, "colmap_feature_type")
     other = vi_map.feature_type != feature_type
     if other.all():
         types = ", ".join(type_name(kind) for kind in sorted(types_of(vi_map.frames))) or "none"

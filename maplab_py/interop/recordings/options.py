@@ -24,11 +24,6 @@ class ReadingOptions(Options):
     time_unit: str = time_unit_option()
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            FlagError: A value is out of range.
-        """
         super().__post_init__()
         if self.image_bits and not 8 <= self.image_bits <= 16:
             raise FlagError(f"--image_bits={self.image_bits}: wants 8 to 16, or 0")
@@ -103,11 +98,6 @@ class StreamOptions(Options, prefix="vio_"):
     """Report intervals between IMU samples that are longer than this"""
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            FlagError: A value is negative, or the end is not after the start.
-        """
         super().__post_init__()
         if self.end_s and self.end_s <= self.start_s:
             raise FlagError(

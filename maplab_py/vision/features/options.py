@@ -1,6 +1,5 @@
 """Options of keypoints, with maplab's flag names where it has them."""
 
-from maplab_py.errors import FlagError
 from maplab_py.options import Options, option
 
 DETECTORS = ("fast", "agast")
@@ -30,7 +29,7 @@ class FeatureOptions(Options, prefix="feature_tracking_"):
         20, ge=4, le=1000, flag="min_tracking_distance_to_image_border_px"
     )
     """Smallest distance of a keypoint to the image border; descriptors need 20"""
-    descriptor_type: str = "brisk"
+    descriptor_type: str = option("brisk", choices=DESCRIPTORS)
     """Descriptor of tracked keypoints: brisk (Binary, 64 bytes), or xfeat (XFeat, 64 numbers, a network:
     install_features), which other light and other directions change less"""
     descriptor_size_px: float = option(12.0, ge=1, le=1000)
@@ -45,25 +44,3 @@ class FeatureOptions(Options, prefix="feature_tracking_"):
     """Track in images resized by this factor; keypoints are of the recorded size"""
     image_mask_path: str = option("", flag="rovio_image_mask_path")
     """Image in which black areas are not to be used, or several, by camera, separated by commas"""
-
-    def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            FlagError: A value is out of its range, or the descriptor is not available.
-        """
-        super().__post_init__()
-        if self.detector_type not in DETECTORS:
-            raise FlagError(
-                f"--{self.flag_prefix}detector_type={self.detector_type}: wants one of "
-                + ", ".join(DETECTORS)
-            )
-        if self.descriptor_type == "freak":
-            raise FlagError(
-                f"--{self.flag_prefix}descriptor_type=freak: FREAK is not in the OpenCV that this "
-                "package uses: choose brisk"
-            )
-        if self.descriptor_type not in DESCRIPTORS:
-            raise FlagError(
-                f"--{self.flag_prefix}descriptor_type={self.descriptor_type}: wants brisk or xfeat"
-            )

@@ -35,11 +35,6 @@ class TrackingOptions(FeatureOptions, prefix="feature_tracking_"):
     """Distance at which other cameras look for a point of unknown distance"""
 
     def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            FlagError: A value is out of its range, or the descriptor is not available.
-        """
         super().__post_init__()
         if self.patch_size_px % 2 == 0:
             raise FlagError(

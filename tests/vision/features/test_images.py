@@ -93,7 +93,7 @@ def test_images_that_are_refused(image: np.ndarray) -> None:
 
 
 def test_freak_is_refused_in_a_line() -> None:
-    with pytest.raises(FlagError, match="feature_tracking_descriptor_type=freak: FREAK is not in"):
+    with pytest.raises(FlagError, match="descriptor_type=freak: must be one of brisk, xfeat"):
         FeatureOptions(descriptor_type="freak")
 
 
