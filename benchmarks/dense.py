@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from maplab_py.algorithms.dense import clouds, depth_inputs, fusion, meshing
-from maplab_py.algorithms.dense.grid import GridSettings, TsdfGrid
+from maplab_py.algorithms.dense.grid import GridSettings, TsdfGrid, blocks_of_views
 from maplab_py.algorithms.dense.options import MESH_MIN_WEIGHT, FusionOptions, StereoOptions
 from maplab_py.algorithms.dense.reconstruction import StereoSettings, reconstruct_stereo
 from maplab_py.algorithms.dense.resources import FrameResources
@@ -138,12 +138,11 @@ def _integrate(depths: Any, poses: list[F64]) -> Integration:
     settings = GridSettings(
         VOXEL_M, 3.0 * VOXEL_M, o.min_ray_length_m, FAR_M, o.weight_depth_power, o.max_weight
     )
-    grid = TsdfGrid(settings)
     cpu, wall = time.process_time(), time.perf_counter()
-    for view, pose in zip(depths, poses, strict=True):
-        grid.allocate(*view, pose)
-    for view, pose in zip(depths, poses, strict=True):
-        grid.integrate(*view, pose)
+    views = [(*view, pose) for view, pose in zip(depths, poses, strict=True)]
+    grid = TsdfGrid.unobserved(settings, blocks_of_views(views, settings))
+    for view in views:
+        grid.integrate(*view)
     cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
     return Integration(1e3 * cpu / len(depths), 1e3 * wall / len(depths), grid.nbytes / 1e6)
 

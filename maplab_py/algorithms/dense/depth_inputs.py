@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from maplab_py.algorithms.dense.clouds import depth_of_cloud
-from maplab_py.algorithms.dense.grid import GridSettings, TsdfGrid
+from maplab_py.algorithms.dense.grid import GridSettings, TsdfGrid, View, blocks_of_views
 from maplab_py.algorithms.dense.options import FusionOptions
 from maplab_py.algorithms.dense.pinhole import ImageMap, Pinhole, undistorted
 from maplab_py.algorithms.dense.resources import CLOUDS, DEPTH_MAPS, FrameResources
@@ -88,20 +89,18 @@ def fuse_views(
         EstimationError: There is no depth in the range of the settings.
         NotEnoughMemory: The grid exceeds the allowed memory.
     """
-    grid, count = TsdfGrid(settings), len(resources)
-    matrices = se3.to_matrix(poses)
-    for done, row in enumerate(resources.tolist()):
-        progress.step(done, 2 * count, "making the blocks of the grid")
-        grid.allocate(*depth.view(row), matrices[done], with_free_space=with_free_space)
-    if not grid.count:
+    count = len(resources)
+    views = depth.views(resources, poses, progress, "making the blocks of the grid")
+    blocks = blocks_of_views(views, settings, with_free_space=with_free_space)
+    if not len(blocks):
         raise EstimationError(
             f"{counted(count, 'depth map')} without any depth from {settings.min_depth_m:g} m to "
             f"{settings.max_depth_m:g} m: choose another --dense_tsdf_min_ray_length_m or "
             "--dense_tsdf_max_ray_length_m"
         )
-    for done, row in enumerate(resources.tolist()):
-        progress.step(count + done, 2 * count, "fusing depth")
-        grid.integrate(*depth.view(row), matrices[done])
+    grid = TsdfGrid.unobserved(settings, blocks)
+    for view in depth.views(resources, poses, progress, "fusing depth"):
+        grid.integrate(*view)
     return grid
 
 
@@ -166,6 +165,12 @@ class DepthViews:
         """Return the poses T_M_C (N, 7) of depth resources."""
         owners = self._resources.vi_map.resources.owner[rows].tolist()
         return se3.compose(T_M_G, np.stack([self._resources.T_G_C(frame) for frame in owners]))
+
+    def views(self, rows: I64, T_M_C: F64, progress: Progress, what: str) -> Iterator[View]:
+        """Yield the depth maps of resources with the poses (N, 7) of their cameras."""
+        for done, (row, T) in enumerate(zip(rows.tolist(), se3.to_matrix(T_M_C), strict=True)):
+            progress.step(done, len(rows), what)
+            yield *self.view(row), T
 
     def view(self, row: int) -> tuple[F32, Pinhole]:
         """Return a depth map (H, W) [m] of a perspective camera, and the camera."""

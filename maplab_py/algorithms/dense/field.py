@@ -7,7 +7,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from maplab_py.algorithms.dense import depth_inputs
-from maplab_py.algorithms.dense.grid import GridContent, GridFormat, TsdfGrid, encode_arrays
+from maplab_py.algorithms.dense.grid import (
+    BLOCK_SHAPE,
+    GridContent,
+    GridFormat,
+    TsdfGrid,
+    encode_arrays,
+    rows_in,
+)
 from maplab_py.algorithms.dense.grid_kernels import BLOCK_SIDE
 from maplab_py.algorithms.dense.options import MESH_MIN_WEIGHT, DistanceOptions, FusionOptions
 from maplab_py.algorithms.dense.resources import chosen_missions
@@ -29,8 +36,6 @@ _BYTES_PER_BLOCK = 4 * BLOCK_SIDE**3 + 12
 _BYTES_PER_NEIGHBOUR = 100
 """Memory of a block near a camera while blocks are collected."""
 _HALF_DIAGONAL = 0.5 * np.sqrt(3.0)
-_OFFSETS = np.stack(np.meshgrid(*[np.arange(BLOCK_SIDE)] * 3, indexing="ij"), -1).reshape(-1, 3)
-"""Places (512, 3) of the voxels in a block."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -50,7 +55,7 @@ class DistanceField:
         """Return the distances (N,) of the voxels in which points (N, 3) lie; NaN = unknown."""
         voxel = np.floor(np.asarray(p) / self.voxel_size_m).astype(np.int64)
         block = voxel // BLOCK_SIDE
-        row = _rows_in(self.coordinates, block)
+        row = rows_in(self.coordinates, block)
         i, j, k = (voxel - block * BLOCK_SIDE).T
         distance: F64 = self.distance_m[row, i, j, k].astype(np.float64)
         distance[row < 0] = np.nan
@@ -59,8 +64,9 @@ class DistanceField:
 
 def voxel_centres(coordinates: I32, voxel_size_m: float) -> F64:
     """Return the centres (B, 8, 8, 8, 3) [m] of the voxels of blocks (B, 3)."""
-    voxels = coordinates[:, None].astype(np.int64) * BLOCK_SIDE + _OFFSETS
-    centres: F64 = voxels.reshape(-1, *(BLOCK_SIDE,) * 3, 3) + np.float64(0.5)
+    offsets = np.moveaxis(np.indices(BLOCK_SHAPE), 0, -1)
+    voxels = coordinates[:, None, None, None].astype(np.int64) * BLOCK_SIDE + offsets
+    centres: F64 = voxels + np.float64(0.5)
     return centres * voxel_size_m
 
 
@@ -93,19 +99,18 @@ def distance_field(
         )
     tree = TriangleTree(mesh.p, mesh.faces)
     size_m = grid.settings.voxel_size_m
-    in_grid = coordinates = _sorted_blocks(grid.coordinates)
+    coordinates = grid.coordinates
     if options.use_clear_sphere:
         around = _blocks_around(cameras, options.clear_sphere_outer_radius, BLOCK_SIDE * size_m)
-        coordinates = _sorted_blocks(np.concatenate([coordinates, around]))
+        coordinates = np.unique(np.concatenate([coordinates, around]), axis=0)
     require_memory(len(coordinates) * _BYTES_PER_BLOCK, "the distance field")
-    row = _rows_in(in_grid, coordinates)
-    order = np.lexsort(grid.coordinates.T[::-1])
-    distance = np.empty((len(coordinates), *(BLOCK_SIDE,) * 3), dtype=np.float32)
+    row = rows_in(grid.coordinates, coordinates)
+    distance = np.empty((len(coordinates), *BLOCK_SHAPE), dtype=np.float32)
     for first in range(0, len(coordinates), _BLOCKS_AT_A_TIME):
         progress.step(first, len(coordinates), "distances from the surface")
         part = slice(first, first + _BLOCKS_AT_A_TIME)
         centres = voxel_centres(coordinates[part], size_m)
-        known, is_behind = _observed(grid, order, row[part], min_weight)
+        known, is_behind = _observed(grid, row[part], min_weight)
         if options.use_clear_sphere:
             spheres = _in_spheres(centres, cameras, options) & ~known[..., None]
             known |= spheres[..., 0]
@@ -116,17 +121,15 @@ def distance_field(
     return DistanceField(size_m, options.max_distance_m, coordinates[kept], distance[kept])
 
 
-def _observed(grid: TsdfGrid, order: I64, rows: I64, min_weight: float) -> tuple[Mask, Mask]:
+def _observed(grid: TsdfGrid, rows: I64, min_weight: float) -> tuple[Mask, Mask]:
     """Return which voxels (b, 8, 8, 8) are known, and which of these lie behind a surface.
 
     Args:
-        order: Rows of its blocks in the order of their coordinates.
-        rows: Places (b,) of the blocks in that order, -1 = not in the grid.
+        rows: Rows (b,) of the blocks, -1 = not in the grid.
         min_weight: See `distance_field`.
     """
-    block = order[rows]
-    weight = np.where((rows >= 0)[:, None, None, None], grid.weight[block], np.float32(0.0))
-    is_behind = grid.distance[block] < 0.0
+    weight = np.where((rows >= 0)[:, None, None, None], grid.weight[rows], np.float32(0.0))
+    is_behind = grid.distance[rows] < 0.0
     known = (weight > 0.0) & (~is_behind | (weight >= min_weight))
     return known, is_behind & known
 
@@ -160,25 +163,6 @@ def _blocks_around(cameras: F64, radius_m: float, block_m: float) -> I32:
     return np.asarray(blocks[near], dtype=np.int32)
 
 
-def _sorted_blocks(coordinates: I32) -> I32:
-    """Return blocks (B, 3) without repetitions, in the order of their coordinates."""
-    return np.unique(coordinates, axis=0)
-
-
-def _rows_in(blocks: I32, wanted: I32 | I64) -> I64:
-    """Return the rows (N,) of wanted blocks (N, 3) in sorted blocks (B, 3), -1 = not there."""
-    if not len(blocks):
-        return np.full(len(wanted), -1, dtype=np.int64)
-    low = blocks.min(axis=0).astype(np.int64) - 1
-    size = blocks.max(axis=0).astype(np.int64) - low + 2
-    keys, queries = (
-        np.ravel_multi_index(tuple(np.clip(c - low, 0, size - 1).T), tuple(size))
-        for c in (blocks, wanted)
-    )
-    place = np.minimum(np.searchsorted(keys, queries), len(keys) - 1)
-    return np.where(keys[place] == queries, place, -1)
-
-
 _FORMAT = GridFormat("esdf 1", "distance field", "create_esdf_from_depth_resource")
 
 
@@ -204,7 +188,7 @@ def decode_field(data: bytes, source: str) -> DistanceField:
         float(content.value("voxel_size_m")),
         float(content.value("max_distance_m")),
         content.array("<i4", (blocks, 3)),
-        content.array("<f4", (blocks, *(BLOCK_SIDE,) * 3)),
+        content.array("<f4", (blocks, *BLOCK_SHAPE)),
     )
 
 

@@ -8,13 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from maplab_py.algorithms.dense import depth_inputs, grid_kernels
+from maplab_py.algorithms.dense import depth_inputs
 from maplab_py.algorithms.dense.grid import (
+    BLOCK_SHAPE,
     GridContent,
     GridFormat,
     GridSettings,
     TsdfGrid,
+    blocks_of_views,
     encode_arrays,
+    rows_in,
 )
 from maplab_py.algorithms.dense.options import FusionOptions
 from maplab_py.algorithms.dense.resources import chosen_missions
@@ -183,13 +186,13 @@ def update_grids(
         poses = depth.poses(resources, se3.inverse(vi_map.T_G_M[owner]))
         moved = _motion_m(stored.fused.T_M_C, poses) > threshold_m
         current = np.where(moved[:, None], poses, stored.fused.T_M_C)
-        if moved.any():
-            _follow(stored, depth, resources, moved, current, progress)
-        count = int(np.count_nonzero(moved))
-        reports.append(_report(vi_map, group, stored.grid, len(resources), count, count))
+        grid, count = stored.grid, int(np.count_nonzero(moved))
+        if count:
+            grid = _follow(stored, depth, resources, moved, current, progress)
+        reports.append(_report(vi_map, group, grid, len(resources), count, count))
         if count:
             fused = FusedDepth(stored.fused.resource_id, current)
-            new.add(GRID_TYPE, encode_grid(StoredGrid(stored.grid, fused)))
+            new.add(GRID_TYPE, encode_grid(StoredGrid(grid, fused)))
             owners.append(owner)
             replaced[row] = True
     if owners:
@@ -225,32 +228,33 @@ def _follow(
     moved: Mask,
     T_M_C: F64,
     progress: Progress,
-) -> None:
-    """Bring the depth maps that have moved to their present poses.
+) -> TsdfGrid:
+    """Return the grid with the depth maps that have moved at their present poses.
 
     Afterwards every block has all depth maps again: the others are integrated into new blocks.
 
     Args:
-        stored: Grid with the poses so far; it is changed.
+        stored: Grid with the poses so far.
         resources: Rows (K,) of those in the grid.
         moved: Which of them (K,) have moved.
         T_M_C: Present poses (K, 7) of those, the poses in the grid of the others.
     """
-    grid, indices = stored.grid, np.flatnonzero(moved).tolist()
-    for index in indices:
-        progress.check()
-        view = depth.view(int(resources[index]))
-        grid.remove(*view, se3.to_matrix(stored.fused.T_M_C[index]))
-    known = grid.count
-    for index in indices:
-        progress.check()
-        grid.allocate(*depth.view(int(resources[index])), se3.to_matrix(T_M_C[index]))
-    for index, row in enumerate(resources.tolist()):
-        progress.step(index, len(resources), "updating the grid")
-        if moved[index]:
-            grid.integrate(*depth.view(row), se3.to_matrix(T_M_C[index]))
-        elif grid.count > known:
-            grid.integrate(*depth.view(row), se3.to_matrix(T_M_C[index]), first_block=known)
+    old, rows = stored.grid, np.flatnonzero(moved)
+    grid = dataclasses.replace(old, distance=old.distance.copy(), weight=old.weight.copy())
+    what = "updating the grid"
+    for view in depth.views(resources[rows], stored.fused.T_M_C[rows], progress, what):
+        grid.integrate(*view, sign=-1.0)
+    touched = blocks_of_views(
+        depth.views(resources[rows], T_M_C[rows], progress, what), grid.settings
+    )
+    added = TsdfGrid.unobserved(grid.settings, touched[rows_in(grid.coordinates, touched) < 0])
+    needed = np.flatnonzero(moved | (len(added.coordinates) > 0))
+    views = depth.views(resources[needed], T_M_C[needed], progress, what)
+    for view, has_moved in zip(views, moved[needed].tolist(), strict=True):
+        if has_moved:
+            grid.integrate(*view)
+        added.integrate(*view)
+    return grid.joined(added)
 
 
 def load_grids(
@@ -315,11 +319,10 @@ def _report(
     mission_id = to_hex(vi_map.missions.id[group[0]])
     voxel_m = grid.settings.voxel_size_m
     counts = len(group), maps, added, removed
-    return GridReport(mission_id, *counts, voxel_m, grid.count, grid.nbytes / 1e6)
+    return GridReport(mission_id, *counts, voxel_m, len(grid.coordinates), grid.nbytes / 1e6)
 
 
 _FORMAT = GridFormat("tsdf 1", "grid", "create_tsdf_from_depth_resource")
-_SHAPE = (grid_kernels.BLOCK_SIDE,) * 3
 _WHOLE_NUMBERS = ("depth_power",)
 
 
@@ -341,10 +344,10 @@ class StoredGrid:
 
 def encode_grid(stored: StoredGrid) -> bytes:
     """Return the content of the file; equal grids give equal bytes."""
-    grid = stored.grid.sorted()
+    grid = stored.grid.chosen(np.flatnonzero((stored.grid.weight > 0.0).any(axis=(1, 2, 3))))
     header = {
         **dataclasses.asdict(grid.settings),
-        "blocks": grid.count,
+        "blocks": len(grid.coordinates),
         "depth_maps": len(stored.fused.resource_id),
     }
     fused = stored.fused
@@ -365,8 +368,8 @@ def decode_grid(data: bytes, source: str) -> StoredGrid:
     }
     blocks, maps = content.count("blocks"), content.count("depth_maps")
     coordinates = content.array("<i4", (blocks, 3))
-    distance = content.array("<f4", (blocks, *_SHAPE))
-    weight = content.array("<f4", (blocks, *_SHAPE))
+    distance = content.array("<f4", (blocks, *BLOCK_SHAPE))
+    weight = content.array("<f4", (blocks, *BLOCK_SHAPE))
     ids, poses = content.array("<u8", (maps, 2)), content.array("<f8", (maps, 7))
-    grid = TsdfGrid.of(GridSettings(**values), coordinates, distance, weight)
+    grid = TsdfGrid(GridSettings(**values), coordinates, distance, weight)
     return StoredGrid(grid, FusedDepth(ids.astype(np.uint64), poses.astype(np.float64)))

@@ -5,26 +5,36 @@ from __future__ import annotations
 import dataclasses
 import json
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
 from maplab_py.algorithms.dense import grid_kernels
+from maplab_py.algorithms.dense.grid_kernels import BLOCK_SIDE, KEY_BITS, LIMIT
 from maplab_py.algorithms.dense.pinhole import Pinhole
-from maplab_py.array_types import F32, F64, I32, NDArray
+from maplab_py.array_types import F32, F64, I32, I64, Mask, NDArray
 from maplab_py.errors import MapError
 from maplab_py.memory import require_memory
 
-_FIRST_CAPACITY = 1024
-_TABLE_ROWS_PER_BLOCK = 4
-_BYTES_PER_BLOCK = 8 * grid_kernels.BLOCK_SIDE**3 + 12 + 16 * _TABLE_ROWS_PER_BLOCK
+BLOCK_SHAPE = (BLOCK_SIDE,) * 3
+_BYTES_PER_BLOCK = 8 * BLOCK_SIDE**3 + 12
 _STEPS_PER_BLOCK = 4
-"""Blocks are allocated at pixels that are a quarter of a block apart at the largest depth ..."""
+"""Blocks are taken at pixels that are a quarter of a block apart at the largest depth ..."""
 _MAX_PIXEL_STEP = 8
 """... but no further than this."""
-_LIMIT = 1 << 20
-"""Coordinates of blocks are smaller."""
+_BLOCKS_AT_A_TIME = 2048
+"""Blocks whose voxels are meshed at a time."""
+_CORNERS = np.array([[m & 1, m >> 1 & 1, m >> 2] for m in range(8)])
+"""Offsets of the corners of a cell."""
+_EDGES = [(m, m + (1 << axis)) for axis in range(3) for m in range(8) if not m >> axis & 1]
+"""Edges of a cell between its corners."""
+_AROUND_EDGE = np.ones((3, 4, 4), dtype=np.int64)
+"""Offsets in a bordered block of the four cells around a cell's first edge along x, y and z."""
+_AROUND_EDGE[..., 0] = 0
+for _axis in range(3):
+    _AROUND_EDGE[_axis, [1, 2], 1 + (_axis + 1) % 3] = 0
+    _AROUND_EDGE[_axis, [2, 3], 1 + (_axis + 2) % 3] = 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,156 +57,197 @@ class Mesh:
     faces: I32  # (F, 3)
 
 
+View = tuple[F32, Pinhole, F64]
+"""Depths (H, W) [m] along the optical axis of a camera, 0 = unknown; the camera and its pose (4, 4)."""
+
+
+def blocks_of_views(
+    views: Iterable[View], settings: GridSettings, *, with_free_space: bool = False
+) -> I32:
+    """Return the blocks (B, 3) near the surfaces in depth maps, in the order of their coordinates.
+
+    Args:
+        with_free_space: Also those between the cameras and the surfaces.
+
+    Raises:
+        NotEnoughMemory: A grid of them would exceed the allowed memory.
+        MapError: A surface is too far from the origin for the voxel size.
+    """
+    block_m, keys = BLOCK_SIDE * settings.voxel_size_m, np.empty(0, dtype=np.int64)
+    for depth, pinhole, T_G_C in views:
+        from_origin_m = float(np.abs(T_G_C[:3, 3]).max())
+        if from_origin_m + 2.0 * settings.max_depth_m > block_m * LIMIT:
+            raise MapError(
+                f"a camera is {from_origin_m:.0f} m from the origin: the grid reaches "
+                f"{block_m * LIMIT:.0f} m; use larger voxels (--dense_tsdf_voxel_size_m)"
+            )
+        camera = np.array([pinhole.focal_px, *pinhole.centre_px])
+        step = int(pinhole.focal_px * block_m / (_STEPS_PER_BLOCK * settings.max_depth_m))
+        step = min(max(step, 1), _MAX_PIXEL_STEP)
+        range_m = settings.min_depth_m, settings.max_depth_m
+        numbers = block_m, settings.truncation_m, *range_m, step, float(with_free_space)
+        touched = grid_kernels.keys_of_depth(depth, camera, T_G_C, np.array(numbers))
+        keys = np.union1d(keys, touched)
+        require_memory(len(keys) * _BYTES_PER_BLOCK, "the grid of distances")
+    parts = (keys >> KEY_BITS * place & (2 * LIMIT - 1) for place in (2, 1, 0))
+    return np.stack([part - LIMIT for part in parts], axis=1).astype(np.int32)
+
+
+def rows_in(blocks: I32, wanted: I32 | I64) -> I64:
+    """Return the rows (N,) of wanted blocks (N, 3) in sorted blocks (B, 3), -1 = not there."""
+    if not len(blocks):
+        return np.full(len(wanted), -1, dtype=np.int64)
+    low = blocks.min(axis=0).astype(np.int64) - 1
+    size = blocks.max(axis=0).astype(np.int64) - low + 2
+    keys, queries = (
+        np.ravel_multi_index(tuple(np.clip(c - low, 0, size - 1).T), tuple(size))
+        for c in (blocks, wanted)
+    )
+    place = np.minimum(np.searchsorted(keys, queries), len(keys) - 1)
+    return np.where(keys[place] == queries, place, -1)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
 class TsdfGrid:
     """Mean signed distances to the nearest surface, along the axes of the cameras that saw it.
 
-    Distances are in units of the truncation distance and positive in free space. If all depth maps are
-    allocated before the first is integrated, every block has all of them, the order does not matter, and
-    each can be removed again.
+    Distances are in units of the truncation distance and positive in free space. If every block has all
+    depth maps, their order does not matter, and each can be removed again.
     """
 
-    def __init__(self, settings: GridSettings) -> None:
-        self.settings = settings
-        self.count = 0
-        self._coordinates: I32 = np.zeros((0, 3), dtype=np.int32)
-        shape = (0, grid_kernels.BLOCK_SIDE, grid_kernels.BLOCK_SIDE, grid_kernels.BLOCK_SIDE)
-        self._distance: F32 = np.zeros(shape, dtype=np.float32)
-        self._weight: F32 = np.zeros(shape, dtype=np.float32)
-        self._table = np.zeros((0, 2), dtype=np.int64)
+    settings: GridSettings
+    coordinates: I32  # (B, 3) blocks, sorted, in units of the block's side
+    distance: F32  # (B, 8, 8, 8)
+    weight: F32  # (B, 8, 8, 8) in measurements at a depth of 2 m; 0 = not observed
 
     @classmethod
-    def of(cls, settings: GridSettings, coordinates: I32, distance: F32, weight: F32) -> TsdfGrid:
-        """Make a grid of blocks (B, 3) with distances and weights (B, 8, 8, 8)."""
-        grid = cls(settings)
-        grid._reserve(len(coordinates))
-        grid.count = len(coordinates)
-        grid._coordinates[: grid.count] = coordinates
-        grid._distance[: grid.count] = distance
-        grid._weight[: grid.count] = weight
-        grid_kernels.fill_table(grid.coordinates, grid._table)
-        return grid
-
-    @property
-    def coordinates(self) -> I32:
-        """Blocks (B, 3), in units of the block's side."""
-        return self._coordinates[: self.count]
-
-    @property
-    def distance(self) -> F32:
-        """Distances (B, 8, 8, 8)."""
-        return self._distance[: self.count]
-
-    @property
-    def weight(self) -> F32:
-        """Weights (B, 8, 8, 8), in measurements at a depth of 2 m; 0 = not observed."""
-        return self._weight[: self.count]
+    def unobserved(cls, settings: GridSettings, coordinates: I32) -> TsdfGrid:
+        """Make a grid of sorted blocks (B, 3) that no depth map has been added to."""
+        voxels = np.zeros((len(coordinates), *BLOCK_SHAPE), dtype=np.float32)
+        return cls(settings, coordinates, voxels, voxels.copy())
 
     @property
     def nbytes(self) -> int:
         """Memory of the grid [bytes]."""
-        arrays = (self._coordinates, self._distance, self._weight, self._table)
-        return sum(array.nbytes for array in arrays)
+        return self.coordinates.nbytes + self.distance.nbytes + self.weight.nbytes
 
-    def allocate(
-        self, depth: F32, pinhole: Pinhole, T_G_C: F64, *, with_free_space: bool = False
-    ) -> None:
-        """Make the blocks near the surface in a depth map (H, W) [m] of a camera at a pose (4, 4).
-
-        Args:
-            depth: Depths along the optical axis, 0 = unknown.
-            T_G_C: Pose of the camera.
-            with_free_space: Also make the blocks between the camera and the surface.
-
-        Raises:
-            NotEnoughMemory: The grid would exceed the allowed memory.
-            MapError: A surface is too far from the origin for the voxel size.
-        """
-        s = self.settings
-        block_m = grid_kernels.BLOCK_SIDE * s.voxel_size_m
-        if np.abs(T_G_C[:3, 3]).max() + 2.0 * s.max_depth_m > block_m * _LIMIT:
-            raise MapError(
-                f"a camera is {np.abs(T_G_C[:3, 3]).max():.0f} m from the origin: the grid reaches "
-                f"{block_m * _LIMIT:.0f} m; use larger voxels (--dense_tsdf_voxel_size_m)"
-            )
-        camera = np.array([pinhole.focal_px, *pinhole.centre_px])
-        step = int(pinhole.focal_px * block_m / (_STEPS_PER_BLOCK * s.max_depth_m))
-        step = min(max(step, 1), _MAX_PIXEL_STEP)
-        range_m = s.min_depth_m, s.max_depth_m
-        settings = np.array([block_m, s.truncation_m, *range_m, step, float(with_free_space)])
-        while True:
-            arguments = depth, camera, T_G_C, settings, self._table, self._coordinates
-            count = (
-                grid_kernels.allocate_blocks(*arguments, self.count)
-                if len(self._table)
-                else grid_kernels.FULL
-            )
-            if count != grid_kernels.FULL:
-                break
-            self._reserve(max(2 * len(self._coordinates), _FIRST_CAPACITY))
-        self.count = count
-
-    def integrate(self, depth: F32, pinhole: Pinhole, T_G_C: F64, *, first_block: int = 0) -> None:
-        """Add a depth map to all blocks, or to those from a row on."""
-        self._integrate(depth, pinhole, T_G_C, 1.0, first_block)
-
-    def remove(self, depth: F32, pinhole: Pinhole, T_G_C: F64) -> None:
-        """Take out a depth map that was integrated with the same arguments."""
-        self._integrate(depth, pinhole, T_G_C, -1.0, 0)
-
-    def mesh(self, min_weight: float, most: float = np.inf) -> Mesh:
-        """Return the surface between voxels of at least this weight, and of distances up to `most`."""
-        around = np.empty((self.count, grid_kernels.NEIGHBOURS), dtype=np.int32)
-        grid_kernels.find_neighbours(self.coordinates, self._table, around)
-        cells = np.empty(
-            (self.count, grid_kernels.BLOCK_SIDE, grid_kernels.BLOCK_SIDE, grid_kernels.BLOCK_SIDE),
-            dtype=np.int32,
-        )
-        settings = np.array([self.settings.voxel_size_m, max(min_weight, 1e-12), most])
-        arguments = self.coordinates, around, self.distance, self.weight, settings, cells
-        points = np.empty((grid_kernels.place_vertices(*arguments, np.empty((0, 3))), 3))
-        quads = np.empty((0, 4), dtype=np.int32)
-        if len(points):
-            grid_kernels.place_vertices(*arguments, points)
-            number = grid_kernels.join_vertices(around, self.distance, cells, quads)
-            quads = np.empty((number, 4), dtype=np.int32)
-        if len(quads):
-            grid_kernels.join_vertices(around, self.distance, cells, quads)
-        return _triangulate(points, quads)
-
-    def sorted(self) -> TsdfGrid:
-        """Return the grid with observed blocks only, in the order of their coordinates."""
-        observed = np.flatnonzero((self.weight > 0.0).any(axis=(1, 2, 3)))
-        order = observed[np.lexsort(self.coordinates[observed].T[::-1])]
-        return TsdfGrid.of(
-            self.settings, self.coordinates[order], self.distance[order], self.weight[order]
-        )
-
-    def _integrate(
-        self, depth: F32, pinhole: Pinhole, T_G_C: F64, sign: float, first_block: int
-    ) -> None:
+    def integrate(self, depth: F32, pinhole: Pinhole, T_G_C: F64, *, sign: float = 1.0) -> None:
+        """Add a depth map; with the sign -1, take it out if it was added with the same arguments."""
         s = self.settings
         size = pinhole.width_px, pinhole.height_px
-        image = np.array(
-            [pinhole.focal_px, *pinhole.centre_px, *size, s.min_depth_m, s.max_depth_m]
-        )
-        settings = np.array(
-            [s.voxel_size_m, s.truncation_m, float(s.depth_power), s.max_weight, sign]
-        )
+        image = [pinhole.focal_px, *pinhole.centre_px, *size, s.min_depth_m, s.max_depth_m]
+        settings = [s.voxel_size_m, s.truncation_m, float(s.depth_power), s.max_weight, sign]
+        voxels = self.coordinates, self.distance, self.weight
         T_C_G = np.linalg.inv(T_G_C)
-        blocks = (array[first_block:] for array in (self.coordinates, self.distance, self.weight))
-        grid_kernels.integrate_depth(depth, image, T_C_G, settings, *blocks)
+        grid_kernels.integrate_depth(depth, np.array(image), T_C_G, np.array(settings), *voxels)
 
-    def _reserve(self, capacity: int) -> None:
-        """Make room for so many blocks."""
-        require_memory(capacity * _BYTES_PER_BLOCK, "the grid of distances")
-        for name in ("_coordinates", "_distance", "_weight"):
-            former = getattr(self, name)
-            array = np.zeros((capacity, *former.shape[1:]), dtype=former.dtype)
-            array[: self.count] = former[: self.count]
-            setattr(self, name, array)
-        rows = 1 << int(np.ceil(np.log2(max(_TABLE_ROWS_PER_BLOCK * capacity, 2))))
-        self._table = np.full((rows, 2), -1, dtype=np.int64)
-        grid_kernels.fill_table(self.coordinates, self._table)
+    def chosen(self, rows: I64) -> TsdfGrid:
+        """Return the grid of some of its blocks (rows)."""
+        return TsdfGrid(
+            self.settings, self.coordinates[rows], self.distance[rows], self.weight[rows]
+        )
+
+    def joined(self, other: TsdfGrid) -> TsdfGrid:
+        """Return the grid with the blocks of another one, none of which it has."""
+        coordinates = np.concatenate([self.coordinates, other.coordinates])
+        distance = np.concatenate([self.distance, other.distance])
+        weight = np.concatenate([self.weight, other.weight])
+        joined = TsdfGrid(self.settings, coordinates, distance, weight)
+        return joined.chosen(np.lexsort(coordinates.T[::-1]))
+
+    def mesh(self, min_weight: float, most: float = np.inf) -> Mesh:
+        """Return the surface between voxels of at least this weight, and of distances up to `most`.
+
+        A cell lies between eight voxel centres. It counts only if all eight have been observed; otherwise
+        the rim of the truncation band would become a false surface. Its vertex is the mean of the crossings
+        on its twelve edges. An edge between two voxels of different sign joins the vertices of the four
+        cells around it to a quadrilateral.
+        Source: Gibson, Constrained elastic surface nets, MICCAI 1998.
+        """
+        count, enough = len(self.coordinates), np.float64(max(min_weight, 1e-12))
+        parts = [slice(k, k + _BLOCKS_AT_A_TIME) for k in range(0, count, _BLOCKS_AT_A_TIME)]
+        number = np.full((count, *BLOCK_SHAPE), -1, dtype=np.int32)
+        points, cells, signs = [np.empty((0, 3))], [], []
+        for part in parts:
+            weight = self._with_border(self.weight, part, 1, 0.0)
+            distance = self._with_border(self.distance, part, 1, 0.0)
+            cell, corner = _crossed_cells(np.where(weight >= enough, distance, np.nan), most)
+            voxel = BLOCK_SIDE * self.coordinates[part][cell[:, 0]] + cell[:, 1:]
+            first = sum(map(len, points))
+            number[part][tuple(cell.T)] = np.arange(first, first + len(cell))
+            points.append((voxel + 0.5 + _crossing(corner)) * self.settings.voxel_size_m)
+            cells.append(cell)
+            signs.append(corner[:, [0, 1, 2, 4]] < 0.0)
+        quads = [np.empty((0, 4), dtype=np.int32)]
+        for part, cell, is_negative in zip(parts, cells, signs, strict=True):
+            border = self._with_border(number, part, -1, -1)
+            quads.append(_quads(border, cell, is_negative))
+        return _triangulate(np.concatenate(points), np.concatenate(quads))
+
+    def _with_border(self, voxels: Any, part: slice, step: int, fill: float) -> Any:
+        """Return the voxels (b, 9, 9, 9) of blocks and of the next ones along x, y and z.
+
+        Args:
+            voxels: Values (B, 8, 8, 8).
+            part: Blocks.
+            step: 1 for the next blocks, -1 for the ones before.
+            fill: Value of voxels of blocks that are not there.
+        """
+        inner, beyond, beside = (slice(8), 8, 0) if step > 0 else (slice(1, 9), 0, 7)
+        blocks = self.coordinates[part]
+        result = np.full((len(blocks), *(BLOCK_SIDE + 1,) * 3), fill, dtype=voxels.dtype)
+        for offset in np.ndindex(2, 2, 2):
+            row = rows_in(self.coordinates, blocks + step * np.array(offset))
+            there = np.flatnonzero(row >= 0)
+            to = tuple(beyond if shift else inner for shift in offset)
+            of = tuple(beside if shift else slice(None) for shift in offset)
+            result[(there, *to)] = voxels[(row[there], *of)]
+        return result
+
+
+def _crossed_cells(values: F32, most: float) -> tuple[I64, F32]:
+    """Return the cells (N, 4) that the surface passes, block and place in it, and their corners (N, 8).
+
+    Args:
+        values: Distances (b, 9, 9, 9), NaN = unobserved.
+        most: Largest distance of a voxel beside a surface.
+    """
+    corners = np.stack(
+        [values[:, x : x + 8, y : y + 8, z : z + 8] for x, y, z in _CORNERS], axis=-1
+    )
+    is_observed = (corners <= np.float64(most)).all(axis=-1)
+    negative = np.count_nonzero(corners < 0.0, axis=-1)
+    crossed = is_observed & (negative > 0) & (negative < 8)
+    return np.argwhere(crossed), corners[crossed]
+
+
+def _crossing(corner: F32) -> F64:
+    """Return the means (N, 3) of the surface's crossings of the edges of cells of side 1."""
+    total, count = np.zeros((len(corner), 3)), np.zeros((len(corner), 1))
+    for a, b in _EDGES:
+        rows = np.flatnonzero((corner[:, a] < 0.0) != (corner[:, b] < 0.0))
+        share = corner[rows, a] / (corner[rows, a] - corner[rows, b])
+        total[rows] += _CORNERS[a] + share[:, None] * (_CORNERS[b] - _CORNERS[a])
+        count[rows] += 1.0
+    return total / count
+
+
+def _quads(number: I32, cell: I64, is_negative: Mask) -> I32:
+    """Join the vertices around every edge from a cell's first corner that the surface crosses.
+
+    Corners run anticlockwise as seen from the side of positive distances.
+
+    Args:
+        number: Vertices (b, 9, 9, 9) of the cells of blocks and of those before, -1 = none.
+        cell: Cells (N, 4), see `_crossed_cells`.
+        is_negative: Signs (N, 4) at the first corner and the next ones along x, y and z.
+    """
+    around = [number[tuple((cell + offset).T)] for offset in _AROUND_EDGE.reshape(-1, 4)]
+    corners = np.stack(around, axis=-1).reshape(-1, 3, 4)
+    crossed = is_negative[:, 1:] != is_negative[:, :1]
+    crossed &= (corners >= 0).all(axis=2)
+    quads = np.where(is_negative[:, :1, None], corners, corners[:, :, ::-1])
+    return np.asarray(quads[crossed], dtype=np.int32)
 
 
 def _triangulate(p: F64, quads: I32) -> Mesh:
@@ -205,10 +256,8 @@ def _triangulate(p: F64, quads: I32) -> Mesh:
     turned = diagonals[1] < diagonals[0]
     corners = np.where(turned[:, None], np.roll(quads, -1, axis=1), quads)
     faces = corners[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
-    used = np.zeros(len(p), dtype=np.bool_)
-    used[faces] = True
-    number = np.cumsum(used, dtype=np.int32) - 1
-    return Mesh(p[used], number[faces].astype(np.int32))
+    used, faces = np.unique(faces, return_inverse=True)
+    return Mesh(p[used], faces.reshape(-1, 3).astype(np.int32))
 
 
 # The container of grids in resource files, described in docs/map_format.md.

@@ -14,7 +14,7 @@ from maplab_py.algorithms.dense.field import (
     encode_field,
     voxel_centres,
 )
-from maplab_py.algorithms.dense.grid import GridSettings, TsdfGrid
+from maplab_py.algorithms.dense.grid import GridSettings, TsdfGrid, blocks_of_views
 from maplab_py.algorithms.dense.options import DistanceOptions
 from maplab_py.algorithms.dense.pinhole import Pinhole
 from maplab_py.algorithms.dense.triangle_tree import TriangleTree
@@ -97,7 +97,7 @@ def grid_of(distance_m: F64, blocks: np.ndarray, weight: float = 1.0) -> TsdfGri
     """Return a grid of blocks whose voxels have signed distances (B, 8, 8, 8)."""
     limited = np.clip(distance_m / SETTINGS.truncation_m, -1.0, 1.0).astype(np.float32)
     observed = np.where(distance_m > -SETTINGS.truncation_m, np.float32(weight), np.float32(0.0))
-    return TsdfGrid.of(SETTINGS, blocks.astype(np.int32), limited, observed)
+    return TsdfGrid(SETTINGS, blocks.astype(np.int32), limited, observed)
 
 
 def cube_of_blocks(low: int, high: int) -> np.ndarray:
@@ -162,11 +162,10 @@ def test_the_unseen_is_unknown_and_the_unconfirmed_is_not_behind() -> None:
     weight = np.array(grid.weight)
     weight[truth > 0.5] = 0.0
     weight[truth < -0.2] = 0.1  # less than the mesh needs
-    thinned = TsdfGrid.of(SETTINGS, grid.coordinates, grid.distance, weight)
+    thinned = TsdfGrid(SETTINGS, grid.coordinates, grid.distance, weight)
     field = field_of(thinned)
-    rows = np.lexsort(grid.coordinates.T[::-1])
     known = np.isfinite(field.distance_m)
-    expected = (truth[rows] <= 0.5) & (truth[rows] >= -0.2)
+    expected = (truth <= 0.5) & (truth >= -0.2)
     np.testing.assert_array_equal(known, expected)
 
 
@@ -208,11 +207,13 @@ def test_points_are_looked_up_in_their_voxels() -> None:
 def test_rays_leave_free_space_behind() -> None:
     pinhole = Pinhole(100.0, (79.5, 59.5), 160, 120)
     depth = np.full((120, 160), 2.0, dtype=np.float32)
-    grid, band = TsdfGrid(SETTINGS), TsdfGrid(SETTINGS)
-    grid.allocate(depth, pinhole, np.eye(4), with_free_space=True)
-    grid.integrate(depth, pinhole, np.eye(4))
-    band.allocate(depth, pinhole, np.eye(4))
-    assert {tuple(c) for c in band.coordinates} <= {tuple(c) for c in grid.coordinates}
+    view = depth, pinhole, np.eye(4)
+    band, blocks = (
+        blocks_of_views([view], SETTINGS, with_free_space=free) for free in (False, True)
+    )
+    grid = TsdfGrid.unobserved(SETTINGS, blocks)
+    grid.integrate(*view)
+    assert {tuple(c) for c in band} <= {tuple(c) for c in blocks}
     field = distance_field(grid, np.zeros((1, 3)), DistanceOptions(max_distance_m=5.0), 0.5)
     along = np.arange(0.2, 1.95, 0.1) + 0.05
     on_axis = np.stack([0.01 + 0.0 * along, 0.01 + 0.0 * along, along], axis=1)

@@ -11,7 +11,7 @@ from maplab_py.algorithms.dense import fusion, meshing, pinhole
 from maplab_py.algorithms.dense.clouds import convert_depth_maps
 from maplab_py.algorithms.dense.depth_inputs import SceneDepth, grid_settings
 from maplab_py.algorithms.dense.field import create_fields
-from maplab_py.algorithms.dense.grid import GridSettings, Mesh, TsdfGrid
+from maplab_py.algorithms.dense.grid import GridSettings, Mesh, TsdfGrid, View, blocks_of_views
 from maplab_py.algorithms.dense.options import FusionOptions
 from maplab_py.array_types import F32, F64
 from maplab_py.errors import EstimationError, MapError, UserError
@@ -244,12 +244,14 @@ def directions() -> F64:
 
 
 def sphere_grid() -> TsdfGrid:
-    grid = TsdfGrid(SETTINGS)
     poses = [looking_at_origin(direction, 2.0) for direction in directions()]
-    for T_G_C in poses:
-        grid.allocate(depth_of_sphere(T_G_C), PINHOLE, T_G_C)
-    for T_G_C in poses:
-        grid.integrate(depth_of_sphere(T_G_C), PINHOLE, T_G_C)
+    return grid_of([(depth_of_sphere(T_G_C), PINHOLE, T_G_C) for T_G_C in poses])
+
+
+def grid_of(views: list[View]) -> TsdfGrid:
+    grid = TsdfGrid.unobserved(SETTINGS, blocks_of_views(views, SETTINGS))
+    for view in views:
+        grid.integrate(*view)
     return grid
 
 
@@ -292,12 +294,9 @@ def test_no_triangle_touches_an_unobserved_cell() -> None:
 
 
 def test_the_rim_of_the_band_is_no_surface() -> None:
-    grid = TsdfGrid(SETTINGS)
     depth = np.zeros((120, 160), dtype=np.float32)
     depth[40:80, 60:100] = 2.0  # a patch that hangs in unknown space
-    grid.allocate(depth, PINHOLE, np.eye(4))
-    grid.integrate(depth, PINHOLE, np.eye(4))
-    mesh = grid.mesh(0.1)
+    mesh = grid_of([(depth, PINHOLE, np.eye(4))]).mesh(0.1)
     np.testing.assert_allclose(mesh.p[:, 2], 2.0, atol=1e-3)
 
 
@@ -318,19 +317,13 @@ def test_a_depth_map_that_is_taken_out_leaves_no_trace() -> None:
     grid = sphere_grid()
     wrong = looking_at_origin(np.array([1.0, 0.2, 0.1]), 1.7)
     depth = depth_of_sphere(looking_at_origin(np.array([1.0, 0.2, 0.1]), 2.0))
-    expected = {tuple(c): d for c, d in zip(grid.coordinates, grid.weight.copy(), strict=True)}
-    distances = {tuple(c): d for c, d in zip(grid.coordinates, grid.distance.copy(), strict=True)}
-    grid.allocate(depth, PINHOLE, wrong)
+    weight, distance = grid.weight.copy(), grid.distance.copy()
     grid.integrate(depth, PINHOLE, wrong)
-    assert not np.allclose(grid.weight[: len(expected)], np.stack(list(expected.values())))
-    grid.remove(depth, PINHOLE, wrong)
-    for block, coordinate in enumerate(map(tuple, grid.coordinates)):
-        weight = expected.get(coordinate, np.zeros((8, 8, 8)))
-        np.testing.assert_allclose(grid.weight[block], weight, atol=1e-5)
-        if coordinate in distances:
-            seen = weight > 0.01
-            difference = (grid.distance[block] - distances[coordinate])[seen]
-            np.testing.assert_allclose(difference, 0.0, atol=1e-4)
+    assert not np.allclose(grid.weight, weight)
+    grid.integrate(depth, PINHOLE, wrong, sign=-1.0)
+    np.testing.assert_allclose(grid.weight, weight, atol=1e-5)
+    seen = weight > 0.01
+    np.testing.assert_allclose(grid.distance[seen], distance[seen], atol=1e-4)
 
 
 def stored_sphere() -> fusion.StoredGrid:
@@ -345,11 +338,9 @@ def test_a_grid_file_holds_everything() -> None:
     assert loaded.grid.settings == SETTINGS
     np.testing.assert_array_equal(loaded.fused.resource_id, stored.fused.resource_id)
     assert fusion.encode_grid(loaded) == data
-    mesh, again = stored.grid.sorted().mesh(0.1), loaded.grid.mesh(0.1)
+    mesh, again = stored.grid.mesh(0.1), loaded.grid.mesh(0.1)
     assert mesh.p.tobytes() == again.p.tobytes()
     assert mesh.faces.tobytes() == again.faces.tobytes()
-    depth = depth_of_sphere(looking_at_origin(np.array([1.0, 0.0, 0.0]), 2.0))
-    loaded.grid.allocate(depth, PINHOLE, looking_at_origin(np.array([1.0, 0.0, 0.0]), 2.0))
 
 
 @pytest.mark.parametrize(
@@ -371,24 +362,23 @@ def test_damaged_files_are_refused(damage: object, message: str) -> None:
 
 
 def test_memory_is_bounded() -> None:
-    grid = TsdfGrid(dataclasses.replace(SETTINGS, voxel_size_m=0.002, truncation_m=0.006))
+    settings = dataclasses.replace(SETTINGS, voxel_size_m=0.002, truncation_m=0.006)
     T_G_C = looking_at_origin(np.array([1.0, 0.0, 0.0]), 2.0)
     with (
         memory_limited(0.006, "--dense_max_memory_gb"),
         pytest.raises(NotEnoughMemory, match="--dense_max_memory_gb"),
     ):
-        grid.allocate(depth_of_sphere(T_G_C), PINHOLE, T_G_C)
+        blocks_of_views([(depth_of_sphere(T_G_C), PINHOLE, T_G_C)], settings)
 
 
 def test_places_beyond_the_grid_are_refused() -> None:
-    grid = TsdfGrid(SETTINGS)
     T_G_C = np.eye(4)
     T_G_C[0, 3] = 1e6
     with pytest.raises(MapError, match="larger voxels"):
-        grid.allocate(np.ones((120, 160), dtype=np.float32), PINHOLE, T_G_C)
+        blocks_of_views([(np.ones((120, 160), dtype=np.float32), PINHOLE, T_G_C)], SETTINGS)
 
 
 def test_an_empty_grid_has_no_surface() -> None:
-    mesh = TsdfGrid(SETTINGS).mesh(1.0)
+    mesh = grid_of([]).mesh(1.0)
     assert mesh.p.shape == (0, 3)
     assert mesh.faces.shape == (0, 3)
