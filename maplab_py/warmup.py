@@ -27,7 +27,6 @@ from maplab_py.estimation.window.warmup import window_jobs
 from maplab_py.frontend import gyroscope
 from maplab_py.frontend.initialization import gyro_bias
 from maplab_py.geometry import se3
-from maplab_py.interop.colmap import binary as colmap_binary
 from maplab_py.interop.g2o import PoseGraph
 from maplab_py.kernel_cache import cache_folder
 from maplab_py.progress import SILENT, Progress
@@ -66,7 +65,6 @@ def jobs() -> dict[str, Callable[[], None]]:
         "message scan": _scan_message,
         "dense maps": _compile_dense,
         "guided matching": guided.compile_kernels,
-        "COLMAP points": colmap_binary.compile_kernels,
         "image rendering": _render_room,
         "start of the odometry": gyro_bias.compile_kernels,
         "gyroscope": gyroscope.compile_kernels,

@@ -6,9 +6,8 @@ ITU-T T.81.
 """
 
 import dataclasses
+import io
 import re
-import struct
-import zlib
 from collections.abc import Iterable
 from typing import Any
 
@@ -24,10 +23,10 @@ CONTAINER_BITS = 16
 SAMPLES = 8
 """Images of a camera in which the range of its values is sought."""
 _CAMERA_BITS = (8, 10, 12, 14, 16)
-_PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
+_PNG = b"\x89PNG\r\n\x1a\n"
 _PNG_BIT_DEPTH = 24  # place of the byte in the file
-_JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
-_JPEG_FRAME_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_ENDS = {_PNG: b"IEND\xaeB`\x82", b"\xff\xd8": b"\xff\xd9"}
+"""First and last bytes of PNG and JPEG images."""
 _OTHER_FORMATS = {
     b"RIFF": "WebP",
     b"BM": "BMP",
@@ -204,15 +203,9 @@ def encoded_size(name: str, data: bytes, form: str = "") -> tuple[int, int]:
     Raises:
         MapError: It is neither, it is truncated, or a checksum is wrong.
     """
-    if data.startswith(_PNG):
-        _check_png(data, name)
-        width, height = struct.unpack(">II", data[16:24])
-        return int(width), int(height)
-    if data.startswith(_JPEG):
-        size = _jpeg_size(data)
-        if size is None:
-            raise MapError(f"{name}: the image is truncated; {REMEDY}")
-        return size
+    end = next((end for start, end in _ENDS.items() if data.startswith(start)), b"")
+    if end:
+        return _whole_size(name, data, end)
     if not data:
         raise MapError(f"{name}: the image is empty; {REMEDY}")
     if _VIDEO.search(form) or data.startswith(_VIDEO_START):
@@ -262,38 +255,18 @@ def as_grey(pixels: Any, bits: int) -> U8:
     return as_8_bits(pixels, bits)
 
 
-def _check_png(data: bytes, name: str) -> None:
-    """Check that all chunks of a PNG image are there, with their checksums."""
-    place, kind = len(_PNG), b""
-    while kind != _PNG_END:
-        if place + 12 > len(data):
-            raise MapError(f"{name}: the image is truncated; {REMEDY}")
-        size, kind = struct.unpack(">I4s", data[place : place + 8])
-        end = place + 8 + size
-        if end + 4 > len(data):
-            raise MapError(f"{name}: the image is truncated; {REMEDY}")
-        is_first = place == len(_PNG)
-        checksum = struct.unpack(">I", data[end : end + 4])[0]
-        if zlib.crc32(memoryview(data)[place + 4 : end]) != checksum or (
-            is_first and (kind, size) != (b"IHDR", 13)
-        ):
-            raise MapError(f"{name}: the image is damaged; {REMEDY}")
-        place = end + 4
+def _whole_size(name: str, data: bytes, end: bytes) -> tuple[int, int]:
+    """Return width and height of a PNG or JPEG image; more may follow its end: padding, or a short video."""
+    from PIL import Image
 
-
-def _jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Return width and height from the frame header, None when it or the end marker behind it is not there.
-
-    More may follow the end: padding, or the video of a telephone's motion photo.
-    """
-    place = 2
-    while place + 9 <= len(data) and data[place] == 0xFF:
-        marker = data[place + 1]
-        if marker == 0xFF:  # fill byte
-            place += 1
-            continue
-        if marker in _JPEG_FRAME_MARKERS:
-            height, width = struct.unpack(">HH", data[place + 5 : place + 9])
-            return (int(width), int(height)) if data.rfind(_JPEG_END, place) > 0 else None
-        place += 2 + int(struct.unpack(">H", data[place + 2 : place + 4])[0])
-    return None
+    stream, size, place = io.BytesIO(data), (0, 0), 0
+    try:
+        with Image.open(stream, formats=("PNG", "JPEG")) as image:
+            size, place = image.size, stream.tell()
+            image.verify()  # the checksums of PNG
+    except Exception:  # noqa: BLE001  (the library's own, of any type)
+        size = (0, 0)
+    if not all(size) or data.rfind(end, place) < 0:
+        problem = "damaged" if end in data else "truncated"
+        raise MapError(f"{name}: the image is {problem}; {REMEDY}")
+    return size

@@ -254,7 +254,7 @@ def _make_model(folder: Path) -> None:
 
 
 def _colmap_seeds(folder: Path) -> list[bytes]:
-    """Return the binary files; those in text are read by pycolmap."""
+    """Return the binary files."""
     _make_model(folder)
     files = [(folder / "model" / f"{name}.bin").read_bytes() for name in _MODEL]
     return [bytes([kind]) + content for kind, content in enumerate(files)]

@@ -23,16 +23,6 @@ def write_text(folder: Path) -> None:
     pycolmap.Reconstruction(folder / BINARY).write_text(folder / TEXT)
 
 
-def write_binary(folder: Path) -> None:
-    """Convert the model in the folder `text` to the binary format."""
-    import pycolmap
-
-    (folder / BINARY).mkdir()
-    model = pycolmap.Reconstruction()
-    model.read_text(folder / TEXT)
-    model.write_binary(folder / BINARY)
-
-
 def undistort(folder: Path) -> None:
     """Undistort pixels: of `pixels.npz`, uv (K, 2) and start (C + 1,) by camera of the model `binary`.
 
@@ -113,7 +103,7 @@ def _write_priors(store: Any, model: Any) -> None:
         store.write_pose_prior(prior)
 
 
-JOBS = {job.__name__: job for job in (write_text, write_binary, undistort, database)}
+JOBS = {job.__name__: job for job in (write_text, undistort, database)}
 
 
 def _answer(request: tuple[str, Path]) -> tuple[str, str]:

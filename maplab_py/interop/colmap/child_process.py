@@ -6,13 +6,12 @@ from pathlib import Path
 from maplab_py.cancellation import check_cancelled, cleaned_up
 from maplab_py.child_processes import Service, ServiceEnded, processors
 from maplab_py.errors import MapError
-from maplab_py.interop.colmap import binary, child
+from maplab_py.interop.colmap import child, writing
 from maplab_py.interop.colmap.model import ColmapModel
 
 logger = logging.getLogger(__name__)
 
 _FAILURES = {
-    "write_binary": "is damaged: a line of its text files is no record; copy or write the model again",
     "write_text": "the model cannot be written as text: give --colmap_format=binary",
     "undistort": "a camera of the model cannot be undistorted: let COLMAP undistort it (image_undistorter)",
     "database": "the database cannot be written: leave out --colmap_database",
@@ -22,7 +21,7 @@ _FAILURES = {
 def write_job_model(model: ColmapModel, folder: Path) -> None:
     """Write a model for a job: the folder `binary` below the job's folder, which is temporary."""
     (folder / child.BINARY).mkdir()
-    for name, content in binary.binary_files(model).items():
+    for name, content in writing.binary_files(model).items():
         with (folder / child.BINARY / name).open("wb") as stream:
             stream.writelines(content)
 

@@ -14,7 +14,7 @@ from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.distinct import distinct
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3
-from maplab_py.interop.colmap import binary, child, child_process, undistortion
+from maplab_py.interop.colmap import child, child_process, undistortion, writing
 from maplab_py.interop.colmap import model as colmap
 from maplab_py.interop.colmap.options import ColmapExportOptions, ColmapExportReport
 from maplab_py.output_files import check_writable, copy_file, write_bytes
@@ -68,7 +68,7 @@ def export_colmap(
                 path = folder / f"{kind}.txt"
                 copy_file(work / child.TEXT / path.name, path, overwrite=overwrite)
         else:
-            for file, content in binary.binary_files(model).items():
+            for file, content in writing.binary_files(model).items():
                 write_bytes(folder / file, content, overwrite=overwrite)
         write_bytes(folder / colmap.FILE_NAME, [exported.side_file.content()], overwrite=overwrite)
         if options.colmap_database:

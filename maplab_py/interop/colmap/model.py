@@ -26,6 +26,12 @@ PIXEL_CENTRE = 0.5
 """COLMAP's coordinates of the centre of the first pixel; it is 0 in maplab."""
 FILES = ("cameras", "rigs", "frames", "images", "points3D")
 """Names of a model's files, without suffix."""
+KEYPOINT = np.dtype([("uv", "<f8", 2), ("point", "<i8")])
+POINT = np.dtype(
+    [("id", "<i8"), ("p_W", "<f8", 3), ("colour", "u1", 3), ("error", "<f8"), ("length", "<i8")]
+)
+ELEMENT = np.dtype([("image", "<u4"), ("keypoint", "<u4")])
+"""Keypoint of an image, point without its track, and element of a track in binary files."""
 
 
 class SensorType(IntEnum):

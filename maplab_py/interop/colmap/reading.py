@@ -1,28 +1,21 @@
 """Read the model of a folder, in either format, and check the references within it."""
 
-import dataclasses
-import re
 import struct
-import tempfile
 from pathlib import Path
 
 import numpy as np
 
 from maplab_py.array_types import F64, I64, Mask
-from maplab_py.atomic import replaced_file
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
-from maplab_py.input_files import read_bytes
 from maplab_py.interop.colmap import model as colmap
-from maplab_py.interop.colmap.binary import REMEDY, read_binary, read_binary_cameras
-from maplab_py.interop.colmap.child import BINARY, TEXT
-from maplab_py.interop.colmap.child_process import run_job
+from maplab_py.interop.colmap.records import ANNOUNCED, REMEDY, Records, records_of
 from maplab_py.sensors import Camera
 
-_ROUNDING = 1e-9
-_ANNOUNCED = re.compile(r"# Number of \w+: (\d+)")
 _HEADER_BYTES = 4096
 _NEEDED = ("cameras", "images", "points3D")
+_CAMERA_MODELS = {model.name: model.number for model in colmap.MODELS.values()}
+_SENSORS = {kind.name: int(kind) for kind in colmap.SensorType}
 
 
 def read_model(folder: Path) -> colmap.ColmapModel:
@@ -35,9 +28,9 @@ def read_model(folder: Path) -> colmap.ColmapModel:
     if not folder.is_dir():
         raise UserError(f"--colmap_folder={folder}: no such folder")
     if (folder / "images.bin").exists() or (folder / "cameras.bin").exists():
-        model = read_binary(folder)
+        model = _read_files(folder, ".bin")
     elif (folder / "images.txt").exists():
-        model = _read_text(folder)
+        model = _read_files(folder, ".txt")
     else:
         raise UserError(
             f"--colmap_folder={folder}: has no COLMAP model (cameras, images, points3D as .bin or .txt)"
@@ -80,107 +73,119 @@ def _count(path: Path) -> str:
     """Return the number of records that a file announces, ? where it does not."""
     try:
         if path.suffix == ".txt":
-            announced = _announced(path)
-            return "?" if announced is None else str(announced)
-        with path.open("rb") as stream:
-            return str(*struct.unpack("<Q", stream.read(8)))
+            with path.open(encoding="utf-8", errors="replace") as stream:
+                announced = ANNOUNCED.search(stream.read(_HEADER_BYTES))
+            return "?" if announced is None else announced[1]
+        with path.open("rb") as binary:
+            return str(*struct.unpack("<Q", binary.read(8)))
     except (OSError, struct.error):
         return "?"
 
 
-def _read_text(folder: Path) -> colmap.ColmapModel:
-    """Let pycolmap convert the text, and compare the result with what the files announce.
+def _read_files(folder: Path, suffix: str) -> colmap.ColmapModel:
+    """Read the files of a model; references between them are not checked.
 
-    Names and poses of images are read here: pycolmap cuts names at blanks, and takes poses from the frames.
+    Models of versions without rigs and frames get a rig of each camera, and a frame of each image.
     """
-    for kind in _NEEDED:
-        path = folder / f"{kind}.txt"
-        if not path.is_file():
-            raise MapError(f"cannot read {path}: it is not there; {REMEDY}")
-    with tempfile.TemporaryDirectory(prefix="maplab-colmap-") as name:
-        work = Path(name)
-        (work / TEXT).mkdir()
-        for kind in colmap.FILES:
-            path = folder / f"{kind}.txt"
-            if kind != "images" and path.is_file():
-                (work / TEXT / path.name).symlink_to(path.resolve())
-        names, poses = _text_images(folder / "images.txt", work / TEXT / "images.txt")
-        run_job("write_binary", work, folder)
-        try:
-            model = read_binary(work / BINARY)
-        except MapError as error:  # of the file that was converted
-            reason = (
-                str(error).replace(str(work / BINARY), str(folder)).replace(".bin: ", ".txt: ", 1)
-            )
-            raise MapError(reason) from None
-    images = model.images
-    ids = images.id.tolist()
-    T_C_W = np.array([poses[number] for number in ids]).reshape(-1, 7)
-    images = dataclasses.replace(images, name=tuple(names[number] for number in ids), T_C_W=T_C_W)
-    counts = {
-        "cameras": len(model.cameras),
-        "rigs": len(model.rigs),
-        "frames": len(model.frames.id),
-        "images": len(images.id),
-        "points3D": len(model.points.id),
-    }
-    for kind, count in counts.items():
-        path = folder / f"{kind}.txt"
-        wanted = _announced(path)
-        if wanted is not None and wanted != count:
-            raise MapError(
-                f"{path}: is damaged: it announces {wanted} records and has {count}; {REMEDY}"
-            )
-    return dataclasses.replace(model, images=images)
+    cameras = _cameras(records_of(folder / f"cameras{suffix}"))
+    images = _images(records_of(folder / f"images{suffix}"))
+    points = _points(records_of(folder / f"points3D{suffix}"))
+    rigs_file, frames_file = (folder / f"{kind}{suffix}" for kind in ("rigs", "frames"))
+    if rigs_file.exists() or frames_file.exists():
+        rigs, frames = _rigs(records_of(rigs_file)), _frames(records_of(frames_file))
+        return colmap.ColmapModel(cameras, rigs, frames, images, points)
+    rigs = tuple(
+        colmap.ColmapRig(number, ((colmap.SensorType.CAMERA, number),), se3.identity(1))
+        for number in np.unique(images.camera).tolist()
+    )
+    rows = np.arange(len(images.id))
+    frames = colmap.ColmapFrames(images.id, images.camera, images.T_C_W, rows, images.id)
+    return colmap.ColmapModel(cameras, rigs, frames, images, points)
 
 
-def _text_images(path: Path, copy: Path) -> tuple[dict[int, str], dict[int, F64]]:
-    """Return names and poses T_C_W (7,) by the ids of images, and write a copy with names without blanks.
-
-    Raises:
-        MapError: A line is no image; names it.
-    """
-    names: dict[int, str] = {}
-    poses: dict[int, F64] = {}
-    try:
-        with (
-            path.open(encoding="utf-8-sig") as stream,
-            replaced_file(copy, durable=False) as target,
-        ):
-            for number, line in enumerate(stream, start=1):
-                words = line.split(maxsplit=9)
-                if not words or words[0].startswith("#"):
-                    continue
-                try:
-                    image, values = int(words[0]), np.array(words[1:8], dtype=np.float64)
-                    name = words[9].strip()
-                except (ValueError, IndexError):
-                    raise MapError(
-                        f"{path}:{number}: is no image: wants IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
-                    ) from None
-                length = np.linalg.norm(values[:4])
-                if not np.isfinite(values).all() or length == 0.0:
-                    raise MapError(f"{path}:{number}: the pose of image {image} is none; {REMEDY}")
-                names[image] = name
-                poses[image] = np.concatenate([values[[1, 2, 3, 0]] / length, values[4:]])
-                if abs(length - 1.0) > _ROUNDING:  # COLMAP takes quaternions of any length
-                    words[1:5] = map(repr, (values[:4] / length).tolist())
-                record = " ".join(words[:9]) + f" {image}\n" + next(stream, "\n")
-                target.write(record.encode())
-    except OSError as error:
-        raise MapError(f"cannot read {path}: {error.strerror}; {REMEDY}") from error
-    except UnicodeDecodeError as error:
-        raise MapError(f"{path}: is damaged: it is not UTF-8 text; {REMEDY}") from error
-    return names, poses
+def _cameras(file: Records) -> tuple[colmap.ColmapCamera, ...]:
+    cameras = []
+    for _ in file.records(24):
+        (number,), kind = file.integers("I"), file.word(_CAMERA_MODELS)
+        if kind not in colmap.MODELS:
+            raise file.damaged(f"camera {number} has the unknown camera model {kind}")
+        model, (width, height) = colmap.MODELS[kind], file.integers("QQ")
+        file.wanted = f"{model.name} with {model.parameters} parameters"
+        parameters = file.doubles(model.parameters)
+        if not (0 < width < 1 << 31 and 0 < height < 1 << 31):
+            raise file.damaged(f"the images of camera {number} have no pixels")
+        cameras.append(colmap.ColmapCamera(number, kind, width, height, parameters))
+    return tuple(cameras)
 
 
-def _announced(path: Path) -> int | None:
-    """Return the number of records that the head of a text file tells, None if it does not."""
-    if not path.is_file():
-        return None
-    with path.open("rb") as stream:
-        match = _ANNOUNCED.search(stream.read(_HEADER_BYTES).decode("utf-8", errors="replace"))
-    return int(match[1]) if match else None
+def _rigs(file: Records) -> tuple[colmap.ColmapRig, ...]:
+    rigs = []
+    for _ in file.records(8):
+        number, count = file.integers("II")
+        sensors: list[colmap.Sensor] = []
+        poses: list[F64] = []
+        for row in range(count):
+            sensors.append((file.word(_SENSORS), *file.integers("I")))
+            is_known = not row or file.integers("B")[0]
+            pose = file.pose() if row and is_known else se3.identity()
+            poses.append(pose if is_known else np.full(7, np.nan))
+        rigs.append(colmap.ColmapRig(number, tuple(sensors), _rows(poses)))
+    return tuple(rigs)
+
+
+def _frames(file: Records) -> colmap.ColmapFrames:
+    poses: list[F64] = []
+    heads: list[tuple[int, int]] = []
+    images: list[tuple[int, int]] = []
+    for row, _ in enumerate(file.records(68)):
+        number, rig = file.integers("II")
+        heads.append((number, rig))
+        poses.append(file.pose())
+        for _ in range(*file.integers("I")):
+            kind, (_, image) = file.word(_SENSORS), file.integers("IQ")
+            if kind == colmap.SensorType.CAMERA:
+                images.append((row, image))
+    return colmap.ColmapFrames(*_columns(heads), _rows(poses), *_columns(images))
+
+
+def _images(file: Records) -> colmap.ColmapImages:
+    heads, poses, names = [], [], []
+    keypoints = [np.zeros(0, dtype=colmap.KEYPOINT)]
+    for _ in file.records(69):
+        (number,), pose, (camera,) = file.integers("I"), file.pose(), file.integers("I")
+        names.append(file.text())
+        keypoints.append(file.keypoints())
+        heads.append((number, camera))
+        poses.append(pose)
+    table = np.concatenate(keypoints)
+    if not np.all(np.isfinite(table["uv"])):
+        raise file.damaged("it has keypoints that are not finite")
+    return colmap.ColmapImages(
+        *_columns(heads),
+        _rows(poses),
+        tuple(names),
+        np.array([len(part) for part in keypoints[1:]], dtype=np.int64),
+        np.ascontiguousarray(table["uv"], dtype=np.float64),
+        np.ascontiguousarray(table["point"], dtype=np.int64),
+    )
+
+
+def _points(file: Records) -> colmap.ColmapPoints:
+    table = file.points()
+    p_W = np.ascontiguousarray(table["p_W"], dtype=np.float64)
+    if not np.all(np.isfinite(p_W)):
+        raise file.damaged("it has points that are not finite")
+    ids, error_px = table["id"].astype(np.int64), table["error"].astype(np.float64)
+    return colmap.ColmapPoints(ids, p_W, table["colour"].copy(), error_px)
+
+
+def _columns(rows: list[tuple[int, int]]) -> tuple[I64, I64]:
+    first, second = np.array(rows, dtype=np.int64).reshape(-1, 2).T.copy()
+    return first, second
+
+
+def _rows(poses: list[F64]) -> F64:
+    return np.array(poses, dtype=np.float64).reshape(-1, 7)
 
 
 def check_model(model: colmap.ColmapModel, source: Path) -> None:
@@ -231,7 +236,6 @@ def _refuse(source: Path, sentence: str, ids: I64, wrong: Mask) -> None:
 
 
 _FILES = ("cameras.bin", "cameras.txt")
-_MAX_BYTES = 100_000_000
 
 
 def is_colmap(path: Path) -> bool:
@@ -253,7 +257,7 @@ def read_cameras(path: Path) -> tuple[list[Camera], F64]:
         model = read_model(path)
         cameras, T_R_C = _rig(model, path)
     else:
-        cameras = read_binary_cameras(path) if path.suffix == ".bin" else _text_cameras(path)
+        cameras = _cameras(records_of(path))
         T_R_C = np.atleast_2d(se3.identity())
         if len(cameras) != 1:
             raise UserError(
@@ -275,40 +279,3 @@ def _rig(model: colmap.ColmapModel, folder: Path) -> tuple[tuple[colmap.ColmapCa
     if not np.isfinite(rig.T_C_R).all():
         raise UserError(f"{folder}: rig {rig.id} has a camera without pose: reconstruct it first")
     return tuple(by_id[number] for number in rig.cameras), se3.inverse(rig.T_C_R)
-
-
-def _text_cameras(path: Path) -> tuple[colmap.ColmapCamera, ...]:
-    """Read cameras.txt: lines of id, model, width, height and parameters.
-
-    Raises:
-        MapError: It cannot be read, or a line is wrong.
-    """
-    try:
-        data = read_bytes(path, _MAX_BYTES, remedy="it is no file of cameras", error=MapError)
-    except OSError as error:
-        raise MapError(f"cannot read {path}: {error.strerror}; {REMEDY}") from error
-    numbers = {model.name: model.number for model in colmap.MODELS.values()}
-    cameras = []
-    for number, line in enumerate(data.decode("utf-8", errors="replace").splitlines(), start=1):
-        words = line.split()
-        if not words or words[0].startswith("#"):
-            continue
-        if len(words) < 4 or words[1] not in numbers:
-            raise MapError(
-                f"{path}:{number}: wants id, camera model, width, height and parameters; {REMEDY}"
-            )
-        try:
-            camera_id, width, height = int(words[0]), int(words[2]), int(words[3])
-            parameters = np.array([float(word) for word in words[4:]])
-        except ValueError as error:
-            raise MapError(f"{path}:{number}: {error}; {REMEDY}") from None
-        model = colmap.MODELS[numbers[words[1]]]
-        if len(parameters) != model.parameters or not np.isfinite(parameters).all():
-            raise MapError(
-                f"{path}:{number}: {model.name} has {model.parameters} parameters that are numbers, not "
-                f"{len(parameters)}; {REMEDY}"
-            )
-        if not (0 < width < 1 << 31 and 0 < height < 1 << 31):
-            raise MapError(f"{path}:{number}: the images have no pixels; {REMEDY}")
-        cameras.append(colmap.ColmapCamera(camera_id, model.number, width, height, parameters))
-    return tuple(cameras)

@@ -15,7 +15,6 @@ from maplab_py.algorithms.evaluation.map_comparison import compare_maps
 from maplab_py.errors import FlagError, MapError, UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.interop import calibration_import, trajectories
-from maplab_py.interop.colmap.binary import compile_kernels
 from maplab_py.interop.colmap.exporting import export_colmap, model_of_map
 from maplab_py.interop.colmap.importing import image_times, import_colmap, read_times
 from maplab_py.interop.colmap.model import FILE_NAME
@@ -137,7 +136,7 @@ def test_a_refined_model_keeps_the_ids_that_still_apply(tmp_path: Path) -> None:
     filtered = dataclasses.replace(
         exported, images=dataclasses.replace(exported.images, point=point)
     )
-    from maplab_py.interop.colmap.binary import binary_files
+    from maplab_py.interop.colmap.writing import binary_files
 
     for name, content in binary_files(filtered).items():
         (tmp_path / name).write_bytes(b"".join(content))
@@ -204,7 +203,6 @@ def test_files_are_not_replaced_unasked(tmp_path: Path) -> None:
 def test_a_recorded_map(tmp_path: Path) -> None:
     """The bars: seconds, and every pose and observation back."""
     vi_map, _ = load_map(shared_data("maplab_maps/tango_handheld"))
-    compile_kernels()
     start_s = time.perf_counter()
     report = export_colmap(vi_map, tmp_path, EVERYTHING)
     exported_s = time.perf_counter()
@@ -269,12 +267,13 @@ def test_the_rig_of_a_model(rig_map, tmp_path: Path, form: str) -> None:  # type
     [
         ((), "has 0 cameras"),
         ((OPENCV, OPENCV.replace("1 ", "2 ", 1)), "has 2 cameras, and does not say how they are"),
-        (("1 OPENCV 752",), r"cameras\.txt:2: wants id, camera model, width"),
-        (("1 NEWEST 752 480 1 2 3",), r"cameras\.txt:2: wants id, camera model"),
-        (("1 PINHOLE 752 480 1 2 3",), "PINHOLE has 4 parameters that are numbers, not 3"),
-        (("1 PINHOLE 752 480 1 2 3 nan",), "PINHOLE has 4 parameters that are numbers"),
-        (("1 PINHOLE 752 x 1 2 3 4",), "invalid literal"),
-        (("1 PINHOLE 0 480 1 2 3 4",), "the images have no pixels"),
+        (("1 OPENCV 752",), r"cameras\.txt:2: .* wants id, camera model, width"),
+        (("1 NEWEST 752 480 1 2 3",), r"cameras\.txt:2: .* unknown camera model NEWEST"),
+        (("1 PINHOLE 752 480 1 2 3",), r"cameras\.txt:2: .* wants PINHOLE with 4 parameters"),
+        (("1 PINHOLE 752 480 1 2 3 4 5",), r"cameras\.txt:2: .* wants PINHOLE with 4 parameters"),
+        (("1 PINHOLE 752 480 1 2 3 nan",), r"cameras\.txt:2: .* not finite"),
+        (("1 PINHOLE 752 x 1 2 3 4",), r"cameras\.txt:2: .* wants id, camera model, width"),
+        (("1 PINHOLE 0 480 1 2 3 4",), "the images of camera 1 have no pixels"),
         (("1 DIVISION 752 480 1 2 3 4 5",), "maplab has no camera model DIVISION"),
     ],
 )

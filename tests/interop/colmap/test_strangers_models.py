@@ -75,10 +75,15 @@ def test_names_keep_their_blanks(copy: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "reason"),
     [
-        ("1 1 0 0", r"images\.txt:\d+: is no image: wants IMAGE_ID"),
-        ("1 x 0 0 0 0 0 0 1 a.png", r"images\.txt:\d+: is no image"),
-        ("1 0 0 0 0 0 0 0 1 a.png", r"images\.txt:\d+: the pose of image 1 is none"),
-        ("1 nan 0 0 0 0 0 0 1 a.png", r"images\.txt:\d+: the pose of image 1 is none"),
+        ("1 1 0 0", r"images\.txt:\d+: is damaged: wants IMAGE_ID QW"),
+        ("1 x 0 0 0 0 0 0 1 a.png", r"images\.txt:\d+: is damaged: wants IMAGE_ID QW"),
+        ("1 1 0 0 0 0 0 0 1", r"images\.txt:\d+: is damaged: wants IMAGE_ID QW"),
+        (
+            "1 0 0 0 0 0 0 0 1 a.png",
+            r"images\.txt:\d+: is damaged: it has a quaternion that is not",
+        ),
+        ("1 nan 0 0 0 0 0 0 1 a.png", r"images\.txt:\d+: is damaged: .* not finite"),
+        ("1 1 0 0 0 0 0 0 1 a.png\n1 2", r"images\.txt:\d+: is damaged: wants X Y POINT3D_ID"),
     ],
 )
 def test_lines_that_are_no_image_are_named(copy: Path, line: str, reason: str) -> None:
@@ -88,13 +93,13 @@ def test_lines_that_are_no_image_are_named(copy: Path, line: str, reason: str) -
         import_colmap(copy, ORDER)
 
 
-def test_a_fault_of_the_converted_copy_names_the_text_file(copy: Path) -> None:
+def test_a_fault_names_the_text_file_and_the_line(copy: Path) -> None:
     path = copy / "cameras.txt"
     lines = path.read_text().splitlines()
     words = lines[-1].split()
     path.write_text("\n".join([*lines[:-1], " ".join([*words[:2], "0", *words[3:]]), ""]))
     with pytest.raises(
-        MapError, match=rf"^{path}: is damaged: the images of camera \d+ have no pixels"
+        MapError, match=rf"^{path}:\d+: is damaged: the images of camera \d+ have no pixels"
     ):
         reading.read_model(copy)
 
