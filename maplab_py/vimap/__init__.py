@@ -24,11 +24,12 @@ from maplab_py.vimap.queries import (
     mission_sensor_id,
     mission_time_spans_ns,
     observation_counts,
+    observation_matrix,
     observer_counts,
     resources_of,
     without_resources,
 )
-from maplab_py.vimap.table import ragged_rows, starts_of_counts
+from maplab_py.vimap.table import Groups, ragged_rows, starts_of_counts
 from maplab_py.vimap.tables import (
     NO_ROW,
     AbsolutePoses,
@@ -60,6 +61,7 @@ __all__ = [
     "DescriptorDepth",
     "FeatureType",
     "Frames",
+    "Groups",
     "IdArray",
     "IdIndex",
     "ImuEdges",
@@ -86,6 +88,7 @@ __all__ = [
     "mission_sensor_id",
     "mission_time_spans_ns",
     "observation_counts",
+    "observation_matrix",
     "observer_counts",
     "ragged_rows",
     "random_ids",

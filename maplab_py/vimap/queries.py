@@ -83,6 +83,24 @@ def observer_counts(vi_map: VIMap) -> I64:
     return np.bincount(observed, minlength=len(vi_map.landmarks))
 
 
+def observation_matrix(vi_map: VIMap, pairs: tuple[I64, I64] | None = None) -> Any:
+    """Return the sparse matrix (V, L) of ones where vertices observe landmarks.
+
+    Args:
+        vi_map: The map.
+        pairs: Vertices (N,) and landmarks (N,) of observations; None = all of the map.
+    """
+    from scipy.sparse import csr_array
+
+    rows = vi_map.observations
+    ends: Any = pairs or (vi_map.keypoint_vertex[rows], vi_map.keypoints.landmark[rows])
+    shape = (len(vi_map.vertices), len(vi_map.landmarks))
+    sees = csr_array((np.ones(len(ends[0]), dtype=np.int32), ends), shape=shape)
+    sees.sum_duplicates()
+    sees.data[:] = 1
+    return sees
+
+
 def coobservation_counts(vi_map: VIMap) -> I64:
     """Return the matrix (M, M) of landmarks that both missions observe; the diagonal: by one."""
     missions, landmarks = len(vi_map.missions), len(vi_map.landmarks)

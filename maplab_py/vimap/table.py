@@ -7,6 +7,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from maplab_py.array_types import I64, Rows
+
 
 def column(dtype: DTypeLike, *shape: int, fill: Any = 0) -> Any:
     """Declare one column: rows of `shape` entries of `dtype`; -1 in the shape takes any width.
@@ -146,3 +148,34 @@ def starts_of_counts(counts: NDArray[Any]) -> NDArray[np.int64]:
     start = np.zeros(len(counts) + 1, dtype=np.int64)
     np.cumsum(counts, out=start[1:])
     return start
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Groups(Rows):
+    """Base of dataclasses of groups (N) of items (CSR): the fields `items` have one row per item."""
+
+    items = tuple[str, ...]()
+    start: I64  # (N + 1,): items of group i are rows start[i] .. start[i + 1] - 1
+
+    def __init_subclass__(cls, items: tuple[str, ...] = (), **rest: Any) -> None:
+        """Name the fields of items."""
+        super().__init_subclass__(**rest)
+        cls.items = items
+
+    def __len__(self) -> int:
+        return len(self.start) - 1
+
+    def take(self, rows: NDArray[Any] | slice) -> Self:
+        """Return some of the groups with their items."""
+        groups = np.arange(len(self))[rows]
+        items = ragged_rows(self.start, groups)
+        arrays = {n: a for n, a in self._arrays().items() if n != "start"}
+        taken = {n: array[items if n in self.items else groups] for n, array in arrays.items()}
+        start = starts_of_counts(np.diff(self.start)[groups])
+        return dataclasses.replace(self, **taken, start=start)
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Self]) -> Self:
+        """Return the groups of one part after another."""
+        counts = np.concatenate([np.diff(part.start) for part in parts])
+        return dataclasses.replace(super().concatenate(parts), start=starts_of_counts(counts))

@@ -18,9 +18,15 @@ from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.array_types import I32, I64, Mask, Rows
 from maplab_py.distinct import distinct
 from maplab_py.memory import require_memory
-from maplab_py.vimap import VIMap, ragged_rows, starts_of_counts
+from maplab_py.vimap import (
+    Groups,
+    VIMap,
+    observation_matrix,
+    ragged_rows,
+    starts_of_counts,
+)
 
-_MIN_SHARED_LANDMARKS = 5
+MIN_SHARED_LANDMARKS = 5
 """Number of common landmarks above which vertices belong to the same place."""
 _PLACES_PER_MISSION = 2
 _QUERIES_AT_ONCE = 1024
@@ -41,74 +47,79 @@ class Matches(Rows):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Candidates:
-    """Pairs of a query vertex and a place, with the matches between them (CSR)."""
+class Candidates(Groups, items=("match",)):
+    """Pairs of a query vertex and a place, with the matches between them."""
 
     query_vertex: I64  # (P,)
     place_vertex: I64  # (P,) the vertex with most votes
     votes: I64  # (P,)
-    start: I64  # (P + 1,)
     match: I64  # rows of `Matches`, by candidate
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _MatchesByVertex(Groups, items=("row", "landmark")):
+    """Matches ordered by their query vertex (V of them)."""
+
+    row: I64  # (M,) of `Matches`
+    landmark: I64  # (M,)
 
 
 def find_candidates(
     vi_map: VIMap, features: MapFeatures, matches: Matches, options: LoopClosureOptions
 ) -> Candidates:
     """Return the candidate places in every mission for each query vertex."""
-    seen = _observers(vi_map)  # (L, V)
+    seen = observation_matrix(vi_map).T.tocsr()  # (L, V)
+    seen.sort_indices()
     near = _near(seen)
-    matched = _match(vi_map, features, matches)
-    queries = np.flatnonzero(np.diff(matched.indptr))
-    places: list[I64] = [np.zeros((0, 3), dtype=np.int64)]
-    for begin in range(0, len(queries), _QUERIES_AT_ONCE):
-        chunk = queries[begin : begin + _QUERIES_AT_ONCE]
-        places.append(_best_places(vi_map, chunk, matched[chunk] @ seen, near, options))
-    del matched
-    picks = np.concatenate(places)
-    picks = picks[np.lexsort((picks[:, 1], picks[:, 0]))]
-    by_vertex = _MatchesByVertex.of(features, matches, len(vi_map.vertices))
+    picks = _all_places(vi_map, features, matches, seen, near, options)
+    vertex = features.vertex[matches.query]
+    order = np.argsort(vertex, kind="stable")
+    by_vertex = _MatchesByVertex(
+        start=starts_of_counts(np.bincount(vertex, minlength=len(vi_map.vertices))),
+        row=order,
+        landmark=features.descriptors.label[matches.database[order]],
+    )
     cuts = _cuts(picks, near, seen, by_vertex)
     parts = [
         _with_matches(picks[begin:end], near, seen, by_vertex, options)
         for begin, end in itertools.pairwise(cuts)
     ]
-    return _joined(parts)
+    return Candidates.concatenate(parts)
+
+
+def _all_places(
+    vi_map: VIMap,
+    features: MapFeatures,
+    matches: Matches,
+    seen: Any,
+    near: Any,
+    options: LoopClosureOptions,
+) -> I64:
+    """Return the rows of `_best_places` of all queries, in their order."""
+    from scipy.sparse import csr_array
+
+    landmarks, vertices = seen.shape
+    # ones where a query vertex is matched with a landmark
+    key = features.vertex[matches.query] * landmarks
+    key += features.descriptors.label[matches.database]
+    pair = np.divmod(distinct(key), max(landmarks, 1))
+    ones = np.ones(len(pair[0]), dtype=np.int32)
+    matched = csr_array((ones, pair), shape=(vertices, landmarks))
+    queries = np.flatnonzero(np.diff(matched.indptr))
+    places: list[I64] = [np.zeros((0, 3), dtype=np.int64)]
+    for begin in range(0, len(queries), _QUERIES_AT_ONCE):
+        chunk = queries[begin : begin + _QUERIES_AT_ONCE]
+        places.append(_best_places(vi_map, chunk, matched[chunk] @ seen, near, options))
+    picks = np.concatenate(places)
+    return picks[np.lexsort((picks[:, 1], picks[:, 0]))]
 
 
 def _near(seen: Any) -> Any:
     """Return the matrix (V, V) of ones where two vertices belong to one place."""
     shared = (seen.T @ seen).tocsr()
-    near = (shared >= _MIN_SHARED_LANDMARKS).astype(np.int8).tocsr()
+    near = (shared >= MIN_SHARED_LANDMARKS).astype(np.int8).tocsr()
     near.sort_indices()
     return near
-
-
-def _match(vi_map: VIMap, features: MapFeatures, matches: Matches) -> Any:
-    """Return the matrix (V, L) of ones where a query vertex is matched with a landmark."""
-    from scipy.sparse import csr_array
-
-    shape = len(vi_map.vertices), len(vi_map.landmarks)
-    key = features.vertex[matches.query] * shape[1]
-    key += features.descriptors.label[matches.database]
-    pair = np.divmod(distinct(key), max(shape[1], 1))
-    return csr_array((np.ones(len(pair[0]), dtype=np.int32), pair), shape=shape)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _MatchesByVertex:
-    """Matches ordered by their query vertex (V of them)."""
-
-    start: I64  # (V + 1,)
-    row: I64  # (M,) of `Matches`
-    landmark: I64  # (M,)
-
-    @classmethod
-    def of(cls, features: MapFeatures, matches: Matches, vertices: int) -> _MatchesByVertex:
-        """Order matches (M,)."""
-        vertex = features.vertex[matches.query]
-        order = np.argsort(vertex, kind="stable")
-        landmark = features.descriptors.label[matches.database[order]]
-        return cls(starts_of_counts(np.bincount(vertex, minlength=vertices)), order, landmark)
 
 
 def _cuts(picks: I64, near: Any, seen: Any, matches: _MatchesByVertex) -> I64:
@@ -117,7 +128,7 @@ def _cuts(picks: I64, near: Any, seen: Any, matches: _MatchesByVertex) -> I64:
     The number of distinct landmarks of a place is estimated from some of the places.
     """
     if not len(picks):
-        return np.zeros(1, dtype=np.int64)
+        return np.zeros(2, dtype=np.int64)
     sample = np.unique(np.linspace(0, len(picks) - 1, _SAMPLE).astype(np.int64))
     landmarks = (near[picks[sample, 1]] @ seen.T).nnz / len(sample)
     of_pick = np.diff(matches.start)[picks[:, 0]]
@@ -127,33 +138,6 @@ def _cuts(picks: I64, near: Any, seen: Any, matches: _MatchesByVertex) -> I64:
     largest = float(np.diff(np.append(np.append(0.0, needed[begins[1:] - 1]), needed[-1])).max())
     require_memory(largest, f"looking at {len(picks)} pairs of places")
     return np.append(begins, len(picks))
-
-
-def _joined(parts: list[Candidates]) -> Candidates:
-    """Join the candidates of parts of the picks."""
-    none = np.zeros(0, dtype=np.int64)
-    parts = [*parts, Candidates(none, none, none, np.zeros(1, dtype=np.int64), none)]
-    counts = [np.diff(part.start) for part in parts]
-    return Candidates(
-        query_vertex=np.concatenate([part.query_vertex for part in parts]),
-        place_vertex=np.concatenate([part.place_vertex for part in parts]),
-        votes=np.concatenate([part.votes for part in parts]),
-        start=starts_of_counts(np.concatenate(counts)),
-        match=np.concatenate([part.match for part in parts]),
-    )
-
-
-def _observers(vi_map: VIMap) -> Any:
-    """Return the matrix (L, V) of ones where a vertex observes a landmark."""
-    from scipy.sparse import csr_array
-
-    rows = vi_map.observations
-    landmark, vertex = vi_map.keypoints.landmark[rows], vi_map.keypoint_vertex[rows]
-    shape = (len(vi_map.landmarks), len(vi_map.vertices))
-    seen = csr_array((np.ones(len(rows), dtype=np.int32), (landmark, vertex)), shape=shape)
-    seen.sum_duplicates()
-    seen.data[:] = 1
-    return seen
 
 
 def _best_places(
@@ -180,7 +164,7 @@ def _best_places(
     group = query * len(vi_map.missions) + v.mission[place]
     order = np.lexsort((place, -value, group))
     query, place, value, group = query[order], place[order], value[order], group[order]
-    picks, floor = [], np.zeros(0)
+    picks, floor, stored = [], np.zeros(0), sparse_entries(near)
     for number in range(_PLACES_PER_MISSION):
         is_first = np.append(True, group[1:] != group[:-1])[: len(group)]
         first = np.flatnonzero(is_first)
@@ -192,18 +176,20 @@ def _best_places(
             floor[group[first]] = value[first] * options.fraction_best_scores
         good = first[value[first] >= floor[group[first]]]
         picks.append(np.stack([queries[query[good]], place[good], value[good]], axis=1))
-        left = ~_contains(near, place[first][of_group], place)
+        left = ~is_among(stored, place[first][of_group] * near.shape[1] + place)
         query, place, value, group = query[left], place[left], value[left], group[left]
     return np.concatenate(picks) if picks else np.zeros((0, 3), dtype=np.int64)
 
 
-def _contains(matrix: Any, row: I64, column: I64) -> Mask:
-    """Return which entries (row, column) (N,) a sparse matrix (V, V) with sorted indices has."""
-    width = matrix.shape[1]
-    stored = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr)) * width + matrix.indices
-    wanted = row * width + column
-    where = np.searchsorted(stored, wanted)
-    return np.asarray(np.append(stored, -1)[where] == wanted)
+def sparse_entries(matrix: Any) -> I64:
+    """Return the entries (E,) of a sparse matrix (R, C) with sorted indices, as row * C + column."""
+    rows = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
+    return np.asarray(rows * matrix.shape[1] + matrix.indices)
+
+
+def is_among(entries: I64, wanted: I64) -> Mask:
+    """Return which values (N,) are among sorted ones (E,)."""
+    return np.asarray(np.append(entries, -1)[np.searchsorted(entries, wanted)] == wanted)
 
 
 def _with_matches(
@@ -214,12 +200,7 @@ def _with_matches(
     place.sort_indices()
     row = ragged_rows(matches.start, picks[:, 0])
     pick = np.repeat(np.arange(len(picks)), np.diff(matches.start)[picks[:, 0]])
-    # is landmark[row] in place[pick]: look the pair up among the matrix' sorted entries
-    width = place.shape[1]
-    entry = np.repeat(np.arange(len(picks)) * width, np.diff(place.indptr)) + place.indices
-    wanted = pick * width + matches.landmark[row]
-    where = np.searchsorted(entry, wanted)
-    inside = np.append(entry, -1)[where] == wanted
+    inside = is_among(sparse_entries(place), pick * place.shape[1] + matches.landmark[row])
     row, pick = matches.row[row[inside]], pick[inside]
     count = np.bincount(pick, minlength=len(picks))
     enough = count >= options.min_verify_matches_num

@@ -1,7 +1,5 @@
 """Table of accepted and rejected closures."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -10,7 +8,7 @@ from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.reports import Verdict
 from maplab_py.array_types import F64, I64, Mask, NDArray
 from maplab_py.geometry import so3
-from maplab_py.vimap import IdArray, LoopClosureEdges, VIMap, ragged_rows, starts_of_counts
+from maplab_py.vimap import Groups, IdArray, LoopClosureEdges, VIMap
 
 VERDICTS = tuple(Verdict)
 """Codes of the `verdict` column are indices into this tuple."""
@@ -48,7 +46,7 @@ class GateValues:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Closures(GateValues):
+class Closures(GateValues, Groups, items=("keypoint", "landmark", "bits")):
     """Poses of query vertices relative to places; M is the mission frame of the place."""
 
     id: NDArray[np.uint64]  # (N, 2)
@@ -57,24 +55,9 @@ class Closures(GateValues):
     T_M_I: F64  # (N, 7) of the query, as verified
     T_A_B: F64  # (N, 7) pose of the place's vertex (B) in the query (A)
     covariance: F64  # (N, 6, 6) of T_M_I, [dp, dtheta]
-    start: I64  # (N + 1,) inlier matches of closure i are rows start[i] .. start[i + 1] - 1
-    keypoint: I64  # keypoint row of the map
+    keypoint: I64  # keypoint row of the map, of each inlier match
     landmark: I64  # landmark row
     bits: NDArray[np.int32]  # different bits
-
-    def __len__(self) -> int:
-        return len(self.query_vertex)
-
-    def take(self, rows: I64) -> Closures:
-        """Return the closures of a mask or rows."""
-        inliers = ragged_rows(self.start, rows)
-        per_match = ("keypoint", "landmark", "bits")
-        columns = {
-            field.name: getattr(self, field.name)[inliers if field.name in per_match else rows]
-            for field in dataclasses.fields(self)
-            if field.name != "start"
-        }
-        return Closures(**columns, start=starts_of_counts(np.diff(self.start)[rows]))
 
     def refused_by_reason(self) -> dict[str, int]:
         """Count the rejected closures by reason."""

@@ -6,25 +6,27 @@ similar descriptor suffices.
 """
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 
 from maplab_py.algorithms.landmarks.keypoint_rays import keypoint_rays, landmark_covariance
 from maplab_py.algorithms.loop_closure import features
+from maplab_py.algorithms.loop_closure.candidates import (
+    MIN_SHARED_LANDMARKS,
+    is_among,
+    sparse_entries,
+)
 from maplab_py.algorithms.loop_closure.closure_table import Closures
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.array_types import F64, I64, Mask, NDArray, Rows
 from maplab_py.geometry import se3, so3, symmetric
-from maplab_py.vimap import VIMap, ragged_rows, starts_of_counts
+from maplab_py.vimap import VIMap, observation_matrix, ragged_rows, starts_of_counts
 from maplab_py.vision.descriptors import differences
 from maplab_py.vision.rays_and_points import Rays, points_near_rays
 
 _RADIUS_PX = 12.0
 _MAX_SIGMAS, _BIT_FACTOR = 2.0, 0.75
 """Limits of matches. Wider ones merge more, but on recorded maps also different points (decision 15)."""
-_MIN_SHARED_LANDMARKS = 5
-"""Vertices that share as many landmarks with the place's vertex belong to the place."""
 _CLOSURES_AT_ONCE = 256
 _NOT_COMPARABLE = np.iinfo(np.int32).max
 """Difference of descriptors of different kinds."""
@@ -68,8 +70,7 @@ def guided_matches(
     ]
     empty = np.zeros(0, dtype=np.int64)
     parts.append(LandmarkMatches(empty, empty, empty, empty.astype(np.int32)))
-    fields = [field.name for field in dataclasses.fields(LandmarkMatches)]
-    return LandmarkMatches(*(np.concatenate([getattr(p, f) for p in parts]) for f in fields))
+    return LandmarkMatches.concatenate(parts)
 
 
 class _Search:
@@ -79,10 +80,8 @@ class _Search:
         self._map, self._closures, self._options = vi_map, closures, options
         # the tolerance of an inlier is two deviations of a keypoint
         self._sigma_px = 0.5 * options.ransac_pixel_sigma
-        self._sees = _observations(vi_map)  # (V, L)
-        vertices, landmarks = self._sees.shape
-        rows = np.repeat(np.arange(vertices), np.diff(self._sees.indptr))
-        self._entries = np.append(rows * landmarks + self._sees.indices, -1)
+        self._sees = observation_matrix(vi_map)
+        self._entries = sparse_entries(self._sees)
         self._findable = features.findable_landmarks(vi_map)
         findable = np.flatnonzero(self._findable)
         self._covariance_G = np.zeros((len(vi_map.landmarks), 3, 3))
@@ -131,12 +130,11 @@ class _Search:
         """
         c, sees = self._closures, self._sees
         shared = sees[c.place_vertex[rows]] @ sees.T
-        near = (shared >= _MIN_SHARED_LANDMARKS).astype(np.int32) @ sees
+        near = (shared >= MIN_SHARED_LANDMARKS).astype(np.int32) @ sees
         problem, landmark = near.tocsr().tocoo().coords
         problem, landmark = problem.astype(np.int64), landmark.astype(np.int64)
-        wanted = c.query_vertex[rows][problem] * self._sees.shape[1] + landmark
-        place = np.searchsorted(self._entries[:-1], wanted)
-        new = self._findable[landmark] & ~np.asarray(self._entries[place] == wanted)
+        wanted = c.query_vertex[rows][problem] * sees.shape[1] + landmark
+        new = self._findable[landmark] & ~is_among(self._entries, wanted)
         problem, landmark = problem[new], landmark[new]
         order = np.lexsort((landmark, problem))
         return problem[order], landmark[order]
@@ -214,16 +212,3 @@ def _squared_sigmas(offset: F64, ray: F64, covariance: F64, sigma_m: F64) -> F64
     S = across @ covariance @ across.transpose(0, 2, 1)
     S += np.square(sigma_m)[:, None, None] * np.eye(2)
     return np.asarray(np.einsum("ni,nij,nj->n", error, symmetric.inverse(S), error))
-
-
-def _observations(vi_map: VIMap) -> Any:
-    """Return the matrix (V, L) of ones where a vertex observes a landmark."""
-    from scipy.sparse import csr_array
-
-    rows = vi_map.observations
-    pair = vi_map.keypoint_vertex[rows], vi_map.keypoints.landmark[rows]
-    shape = (len(vi_map.vertices), len(vi_map.landmarks))
-    sees = csr_array((np.ones(len(rows), dtype=np.int32), pair), shape=shape)
-    sees.sum_duplicates()
-    sees.data[:] = 1
-    return sees

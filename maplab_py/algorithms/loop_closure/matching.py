@@ -6,10 +6,12 @@ Then the neighbours only select missions: each query is compared with the missio
 belong, with an index for each, so that the work is proportional to the number of queries.
 """
 
+import dataclasses
+import functools
 import hashlib
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 
 import numpy as np
@@ -49,148 +51,121 @@ def match_features(
         apart: See above.
         asked: Features (rows, ascending) that are the queries; None = all.
     """
-    queries = np.arange(len(features)) if asked is None else asked
-    database = np.flatnonzero(features.in_database)
-    landmarks = len(distinct(features.descriptors.label[database]))
-    if landmarks == 0 or not len(queries):
+    d = features.descriptors
+    search = _Search(
+        features=features,
+        options=options,
+        rule=rule,
+        queries=np.arange(len(features)) if asked is None else asked,
+        database=np.flatnonzero(features.in_database),
+        k=options.num_neighbors if options.num_neighbors > 0 else _NEIGHBOURS,
+        largest=features.kind.largest(options.max_bit_fraction, options.max_descriptor_distance),
+    )
+    landmarks = len(distinct(d.label[search.database]))
+    if landmarks == 0 or not len(search.queries):
         empty = np.zeros(0, dtype=np.int64)
         return Matches(empty, empty, empty.astype(np.int32)), landmarks
-    d = features.descriptors
-    missions = distinct(d.session[database])
-    if len(missions) > options.max_missions_per_query + 1:
-        return _in_chosen_missions(features, options, rule, database, queries), landmarks
-    query, matched = _in_all_missions(features, options, rule, apart, database, queries)
-    return _similar(features, options, query, matched), landmarks
+    if len(distinct(d.session[search.database])) > options.max_missions_per_query + 1:
+        return search.in_chosen_missions(), landmarks
+    return search.similar(*search.in_all_missions(apart)), landmarks
 
 
-def _similar(
-    features: MapFeatures, options: LoopClosureOptions, query: I64, matched: I64
-) -> Matches:
-    """Return the matches whose descriptors differ little enough."""
-    words = features.descriptors.words
-    bits = differences(words, query, words, matched)
-    kept = bits <= _largest(features, options)
-    return Matches(query[kept], matched[kept], bits[kept])
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Search:
+    """Search for the nearest database features of queries; both are rows of the features."""
 
+    features: MapFeatures
+    options: LoopClosureOptions
+    rule: MatchRule
+    queries: I64
+    database: I64
+    k: int  # neighbours
+    largest: float  # difference of a match, as `differences` counts it
 
-def _largest(features: MapFeatures, options: LoopClosureOptions) -> float:
-    """Return the largest difference of a match, as `differences` counts it."""
-    return features.kind.largest(options.max_bit_fraction, options.max_descriptor_distance)
+    def similar(self, query: I64, matched: I64) -> Matches:
+        """Return the matches whose descriptors differ little enough."""
+        words = self.features.descriptors.words
+        matches = Matches(query, matched, differences(words, query, words, matched))
+        return matches.take(matches.bits <= self.largest)
 
+    def in_all_missions(self, apart: bool) -> tuple[I64, I64]:
+        """Return the pairs of queries and their nearest database features."""
+        d = self.features.descriptors
+        asked = d if len(self.queries) == len(d) else d.take(self.queries)
+        others = MatchRule(self.rule.min_time_ns, True)
+        rows = nearest_rows(
+            d.take(self.database),
+            asked,
+            self.k,
+            [self.rule, others] if apart else [self.rule],
+            seed=self.options.seed,
+            words_per_query=self.options.num_words_for_nn_search,
+            max_difference=self.largest,
+        )
+        row = rows[0]
+        if apart:
+            same_session = (row >= 0) & (d.session[self.database][row] == asked.session[:, None])
+            row = np.concatenate([np.where(same_session, row, -1), rows[1]], axis=1)
+        query, column = np.nonzero(row >= 0)
+        return self.queries[query], self.database[row[query, column]]
 
-def _in_all_missions(
-    features: MapFeatures,
-    options: LoopClosureOptions,
-    rule: MatchRule,
-    apart: bool,
-    database: I64,
-    queries: I64,
-) -> tuple[I64, I64]:
-    """Return the pairs of features and their nearest database features."""
-    d = features.descriptors
-    asked = d if len(queries) == len(d) else d.take(queries)
-    others = MatchRule(rule.min_time_ns, True)
-    rows = nearest_rows(
-        d.take(database),
-        asked,
-        _neighbours(options),
-        [rule, others] if apart else [rule],
-        seed=options.seed,
-        words_per_query=options.num_words_for_nn_search,
-        max_difference=_largest(features, options),
-    )
-    row = rows[0]
-    if apart:
-        same_session = (row >= 0) & (d.session[database][row] == asked.session[:, None])
-        row = np.concatenate([np.where(same_session, row, -1), rows[1]], axis=1)
-    query, column = np.nonzero(row >= 0)
-    return queries[query], database[row[query, column]]
+    def in_chosen_missions(self) -> Matches:
+        """Return the matches of each query with the missions chosen for it, from memory if possible."""
+        o, features = self.options, self.features
+        setting = (
+            f"chosen missions {o.num_neighbors} {o.seed} {o.num_words_for_nn_search} "
+            f"{o.max_missions_per_query} {self.largest!r} {features.kind!r} {self.rule!r}"
+        )
+        columns = (features.vertex, features.in_database, self.queries)
+        key = setting, digest(*_columns(features.descriptors), *columns)
+        query, matched, bits = MEMORY.result(key, self._in_chosen_missions)
+        return Matches(query.astype(np.int64), matched.astype(np.int64), bits)
 
+    def _in_chosen_missions(self) -> I32:
+        """Return the matches (3, M) with the nearest features in chosen missions: query, feature, bits.
 
-def _in_chosen_missions(
-    features: MapFeatures,
-    options: LoopClosureOptions,
-    rule: MatchRule,
-    database: I64,
-    queries: I64,
-) -> Matches:
-    """Return the matches of each query with the missions chosen for it; see `remembered`."""
-    setting = (
-        f"chosen missions {options.num_neighbors} {options.seed} "
-        f"{options.num_words_for_nn_search} {options.max_missions_per_query} "
-        f"{_largest(features, options)!r} {features.kind!r} {rule!r}"
-    )
-    columns = (features.vertex, features.in_database, queries)
-    query, matched, bits = remembered(
-        features.descriptors,
-        columns,
-        setting,
-        lambda: _searched_missions(features, options, rule, database, queries),
-    )
-    return Matches(query.astype(np.int64), matched.astype(np.int64), bits)
+        A query's mission is always searched: it reveals places that look alike.
+        """
+        d, vertex = self.features.descriptors, self.features.vertex
+        other = MatchRule(self.rule.min_time_ns, True)
+        nearest = self._nearest(other, self.queries, self.database, max_difference=np.inf)
+        size = int(d.session.max()) + 1
+        chosen = _chosen_missions(
+            self.features, *nearest, self.options.max_missions_per_query, size
+        )
+        del nearest
+        parts = [np.zeros((3, 0), dtype=np.int32)]
+        for mission in range(size):
+            in_mission = self.database[d.session[self.database] == mission]
+            wants = np.zeros(int(vertex.max()) + 1, dtype=np.bool_)
+            wants[chosen[chosen % size == mission] // size] = True
+            is_asked = (d.session[self.queries] == mission) | wants[vertex[self.queries]]
+            if len(in_mission) and is_asked.any():
+                asked = self.queries[is_asked]
+                m = self.similar(*self._nearest(self.rule, asked, in_mission, self.largest))
+                parts.append(np.stack([m.query, m.database, m.bits]).astype(np.int32))
+        result = np.concatenate(parts, axis=1)
+        return result[:, np.argsort(result[0], kind="stable")]
 
-
-def _searched_missions(
-    features: MapFeatures,
-    options: LoopClosureOptions,
-    rule: MatchRule,
-    database: I64,
-    queries: I64,
-) -> I32:
-    """Return the matches (3, M) with the nearest features in chosen missions: query, feature, bits.
-
-    A query's mission is always searched: it reveals places that look alike.
-    """
-    d = features.descriptors
-    other = MatchRule(rule.min_time_ns, True)
-    nearest = _nearest(features, options, other, queries, database, max_difference=np.inf)
-    size = int(d.session.max()) + 1
-    chosen = _chosen_missions(features, *nearest, options.max_missions_per_query, size)
-    del nearest
-    parts = [np.zeros((3, 0), dtype=np.int32)]
-    for mission in range(size):
-        in_mission = database[d.session[database] == mission]
-        wants = np.zeros(int(features.vertex.max()) + 1, dtype=np.bool_)
-        wants[chosen[chosen % size == mission] // size] = True
-        asked = queries[(d.session[queries] == mission) | wants[features.vertex[queries]]]
-        if len(in_mission) and len(asked):
-            pairs = _nearest(
-                features, options, rule, asked, in_mission, _largest(features, options)
-            )
-            matches = _similar(features, options, *pairs)
-            parts.append(np.stack([matches.query, matches.database, matches.bits]).astype(np.int32))
-    result = np.concatenate(parts, axis=1)
-    return result[:, np.argsort(result[0], kind="stable")]
-
-
-def _nearest(
-    features: MapFeatures,
-    options: LoopClosureOptions,
-    rule: MatchRule,
-    query: I64,
-    database: I64,
-    max_difference: float,
-) -> tuple[I64, I64]:
-    """Return the pairs of query features and their nearest database features, not remembered."""
-    d = features.descriptors
-    index = InvertedMultiIndex(
-        d.take(database),
-        seed=options.seed,
-        cells_per_query=options.num_words_for_nn_search,
-        max_distance=max_difference,
-    )
-    parts = []
-    for begin in range(0, len(query), _QUERIES_AT_ONCE):
-        some = query[begin : begin + _QUERIES_AT_ONCE]
-        row = index.nearest(d.take(some), _neighbours(options), rule).row
-        i, j = np.nonzero(row >= 0)
-        parts.append((some[i], database[row[i, j]]))
-    asked, matched = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return asked, matched
-
-
-def _neighbours(options: LoopClosureOptions) -> int:
-    return options.num_neighbors if options.num_neighbors > 0 else _NEIGHBOURS
+    def _nearest(
+        self, rule: MatchRule, query: I64, database: I64, max_difference: float
+    ) -> tuple[I64, I64]:
+        """Return the pairs of query features and their nearest database features, not remembered."""
+        d = self.features.descriptors
+        index = InvertedMultiIndex(
+            d.take(database),
+            seed=self.options.seed,
+            cells_per_query=self.options.num_words_for_nn_search,
+            max_distance=max_difference,
+        )
+        parts = []
+        for begin in range(0, len(query), _QUERIES_AT_ONCE):
+            some = query[begin : begin + _QUERIES_AT_ONCE]
+            row = index.nearest(d.take(some), self.k, rule).row
+            i, j = np.nonzero(row >= 0)
+            parts.append((some[i], database[row[i, j]]))
+        asked, matched = (np.concatenate(column) for column in zip(*parts, strict=True))
+        return asked, matched
 
 
 def _chosen_missions(features: MapFeatures, query: I64, matched: I64, most: int, size: int) -> I64:
@@ -234,36 +209,38 @@ class SearchMemory:
         """
         self.max_bytes = max_bytes
         self._lock = threading.Lock()
-        self._rows: OrderedDict[bytes, I32] = OrderedDict()
+        self._rows: OrderedDict[Hashable, I32] = OrderedDict()
         self._bytes = 0
 
     def __len__(self) -> int:
         return len(self._rows)
 
-    def get(self, key: bytes) -> I32 | None:
-        """Return the result of a search, None if it is not remembered."""
-        with self._lock:
-            if key not in self._rows:
-                return None
-            self._rows.move_to_end(key)
-            return self._rows[key]
+    def result(self, key: Hashable, search: Callable[[], I32]) -> I32:
+        """Return the result of a search, read-only, from memory if it is there.
 
-    def put(self, key: bytes, rows: I32) -> None:
-        """Remember the result of a search, which becomes read-only."""
-        rows.setflags(write=False)
+        Args:
+            key: All that the result depends on.
+            search: Makes the result.
+        """
         with self._lock:
             if key in self._rows:
-                return
-            self._rows[key] = rows
-            self._bytes += rows.nbytes
+                self._rows.move_to_end(key)
+                return self._rows[key]
+        rows = search()
+        rows.setflags(write=False)
+        with self._lock:
+            if key not in self._rows:
+                self._rows[key] = rows
+                self._bytes += rows.nbytes
             most = self.max_bytes
             if most is None:
                 most = max(_MIN_BYTES, int(_SHARE * (available_bytes() + self._bytes)))
             while self._bytes > most:
                 self._bytes -= self._rows.popitem(last=False)[1].nbytes
+        return rows
 
 
-_memory = SearchMemory()
+MEMORY = SearchMemory()
 
 
 def nearest_rows(
@@ -275,7 +252,7 @@ def nearest_rows(
     seed: int,
     words_per_query: int,
     max_difference: float = np.inf,
-    memory: SearchMemory = _memory,
+    memory: SearchMemory = MEMORY,
 ) -> list[I32]:
     """Return the rows (Q, k) of the nearest database descriptors, -1 for none, for each rule.
 
@@ -291,64 +268,28 @@ def nearest_rows(
         max_difference: Neighbours that differ by more are not wanted.
         memory: Where results are kept.
     """
-    setting = f"{seed} {words_per_query} {k} {max_difference!r}"
-    common = hashlib.blake2b(setting.encode(), digest_size=32)
-    for descriptors in (database, queries):
-        _add(common, descriptors)
-    keys = [_key(common, rule) for rule in rules]
-    results = [memory.get(key) for key in keys]
-    if any(rows is None for rows in results):
-        index = InvertedMultiIndex(
+    key = seed, words_per_query, k, max_difference, digest(*_columns(database), *_columns(queries))
+
+    @functools.cache
+    def index() -> InvertedMultiIndex:
+        return InvertedMultiIndex(
             database, seed=seed, cells_per_query=words_per_query, max_distance=max_difference
         )
-        for number, (rule, key) in enumerate(zip(rules, keys, strict=True)):
-            if results[number] is None:
-                rows = index.nearest(queries, k, rule).row
-                memory.put(key, rows)
-                results[number] = rows
-    return [rows for rows in results if rows is not None]
+
+    def search(rule: MatchRule) -> I32:
+        return index().nearest(queries, k, rule).row
+
+    return [memory.result((key, rule), functools.partial(search, rule)) for rule in rules]
 
 
-def remembered(
-    descriptors: DescriptorSet,
-    columns: Sequence[NDArray[Any]],
-    setting: str,
-    search: Callable[[], I32],
-    memory: SearchMemory = _memory,
-) -> I32:
-    """Return the result of a search over descriptors, from memory where nothing has changed.
+def _columns(descriptors: DescriptorSet) -> tuple[NDArray[Any], ...]:
+    return descriptors.projected, *descriptors.columns
 
-    Args:
-        descriptors: What is searched for and in.
-        columns: What else the result depends on.
-        setting: Its parameters.
-        memory: Where results are kept.
-    """
-    digest = hashlib.blake2b(setting.encode(), digest_size=32)
-    _add(digest, descriptors)
+
+def digest(*columns: NDArray[Any]) -> bytes:
+    """Return a digest of arrays with their types and shapes."""
+    result = hashlib.blake2b(digest_size=32)
     for column in columns:
-        _add_column(digest, column)
-    key = digest.digest()
-    result = memory.get(key)
-    if result is None:
-        result = search()
-        memory.put(key, result)
-    return result
-
-
-def _add(digest: hashlib.blake2b, descriptors: DescriptorSet) -> None:
-    """Add all columns."""
-    for column in (descriptors.projected, *descriptors.columns):
-        _add_column(digest, column)
-
-
-def _add_column(digest: hashlib.blake2b, column: NDArray[Any]) -> None:
-    """Add an array with its type and shape."""
-    digest.update(f"{column.dtype} {column.shape}".encode())
-    digest.update(np.ascontiguousarray(column).data)
-
-
-def _key(common: hashlib.blake2b, rule: MatchRule) -> bytes:
-    digest = common.copy()
-    digest.update(repr(rule).encode())
-    return digest.digest()
+        result.update(f"{column.dtype} {column.shape}".encode())
+        result.update(np.ascontiguousarray(column).data)
+    return result.digest()

@@ -4,6 +4,8 @@ Nearest neighbours compare single descriptors. LighterGlue matches all keypoints
 those whose descriptors a change of light has altered too much, in about 0.1 s per pair.
 """
 
+import dataclasses
+
 import numpy as np
 
 from maplab_py.algorithms.loop_closure.candidates import Candidates, Matches
@@ -11,7 +13,7 @@ from maplab_py.algorithms.loop_closure.features import MapFeatures
 from maplab_py.array_types import F32, I64
 from maplab_py.errors import UserError
 from maplab_py.progress import Progress
-from maplab_py.vimap import MissionSensor, VIMap, ragged_rows, starts_of_counts, to_hex
+from maplab_py.vimap import MissionSensor, VIMap, starts_of_counts, to_hex
 from maplab_py.vimap.descriptors import DescriptorDepth
 from maplab_py.vision.descriptors import DescriptorKind, differences
 from maplab_py.vision.features.learned.lighterglue import ImageKeypoints, installed_lighterglue
@@ -55,8 +57,8 @@ def match_again(
         UserError: The network is not installed.
     """
     images = _Images(vi_map, features)
-    a, b = candidates.query_vertex[which], candidates.place_vertex[which]
-    owner, first, second = images.pairs(a, b)
+    again = candidates.take(which)
+    owner, first, second = images.pairs(again.query_vertex, again.place_vertex)
     query, database = images.match(first, second, progress)
     count = np.array([len(rows) for rows in query], dtype=np.int64)
     owner = np.repeat(owner, count)
@@ -67,20 +69,11 @@ def match_again(
     owner, i, j = owner[kept], i[kept], j[kept]
     words = features.descriptors.words
     extra = Matches(i, j, differences(words, i, words, j))
-    before = np.diff(candidates.start)[which]
-    old = candidates.match[ragged_rows(candidates.start, which)]
-    owner = np.concatenate([np.repeat(np.arange(len(which)), before), owner])
-    match = np.concatenate([old, len(matches) + np.arange(len(extra))])
-    return Matches(
-        *(
-            np.concatenate([getattr(matches, n), getattr(extra, n)])
-            for n in ("query", "database", "bits")
-        )
-    ), Candidates(
-        query_vertex=a,
-        place_vertex=b,
-        votes=candidates.votes[which],
-        start=starts_of_counts(np.bincount(owner, minlength=len(which))),
+    owner = np.concatenate([np.repeat(np.arange(len(again)), np.diff(again.start)), owner])
+    match = np.concatenate([again.match, len(matches) + np.arange(len(extra))])
+    return Matches.concatenate([matches, extra]), dataclasses.replace(
+        again,
+        start=starts_of_counts(np.bincount(owner, minlength=len(again))),
         match=match[np.argsort(owner, kind="stable")],
     )
 

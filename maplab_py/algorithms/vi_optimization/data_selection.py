@@ -102,15 +102,12 @@ def _links(vi_map: VIMap, vertex: I64, landmark: I64, limit: int) -> tuple[I64, 
 
 def _covisible(vi_map: VIMap, vertex: I64, landmark: I64) -> tuple[I64, I64, I64]:
     """Return pairs of vertices (N,), the first the smaller row, and how many landmarks they share."""
-    from scipy.sparse import csr_array, triu
+    from scipy.sparse import triu
 
     pairs = float(np.sum(np.square(np.bincount(landmark).astype(np.float64))))
     largest = float(len(vi_map.vertices)) ** 2
     require_memory(_BYTES_PER_PAIR * min(pairs, largest), "counting what vertices share")
-    shape = (len(vi_map.vertices), len(vi_map.landmarks))
-    sees = csr_array((np.ones(len(vertex), dtype=np.int32), (vertex, landmark)), shape=shape)
-    sees.sum_duplicates()
-    sees.data[:] = 1
+    sees = queries.observation_matrix(vi_map, (vertex, landmark))
     shared = triu(sees @ sees.T, k=1).tocoo()
     a, b = (index.astype(np.int64) for index in shared.coords)
     return a, b, shared.data.astype(np.int64)

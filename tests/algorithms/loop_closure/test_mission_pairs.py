@@ -269,7 +269,7 @@ def test_all_missions_are_anchored_although_each_query_sees_two():
 
 def test_a_repeated_search_of_chosen_missions_builds_no_index(room, monkeypatch):
     _, features = room
-    monkeypatch.setattr(matching.remembered, "__defaults__", (SearchMemory(),))
+    monkeypatch.setattr(matching, "MEMORY", SearchMemory())
     first, _ = match_features(features, LIMITED, MATCH_RULE, apart=True)
     monkeypatch.delattr(matching, "InvertedMultiIndex")
     again, _ = match_features(
