@@ -19,23 +19,16 @@ _AGAIN = (messages.Ending.FAILED, messages.Ending.LOST)
 
 @dataclasses.dataclass(frozen=True)
 class RunSettings:
-    """Settings that all tasks of a run share.
+    """Settings that all tasks of a run share."""
 
-    Attributes:
-        options: How the pipeline is run.
-        results: Folder of all results; absolute.
-        folder: Folder to which relative paths in commands are relative; absolute.
-        flags: Lasting flags of commands, by name.
-        keep_going: Go on with other tasks, and with a task's next command, after a failure.
-        discard: Maps may be left unsaved.
-    """
-
-    options: PipelineOptions
-    results: Path
-    folder: Path
+    options: PipelineOptions  # how the pipeline is run
+    results: Path  # folder of all results; absolute
+    folder: Path  # folder to which relative paths in commands are relative; absolute
+    # lasting flags of commands, by name
     flags: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    # go on with other tasks, and with a task's next command, after a failure
     keep_going: bool = False
-    discard: bool = False
+    discard: bool = False  # maps may be left unsaved
 
 
 @dataclasses.dataclass

@@ -136,19 +136,12 @@ STARTS = " starts "
 
 @dataclasses.dataclass(frozen=True)
 class ChildEnd:
-    """Exit of a child process.
+    """Exit of a child process."""
 
-    Attributes:
-        status: Exit status; negative for a signal.
-        peak_gb: Largest resident memory that was seen [GB].
-        is_over_memory: It was stopped because it took more than it may.
-        is_cancelled: It was stopped because nobody wants its result.
-    """
-
-    status: int
-    peak_gb: float
-    is_over_memory: bool
-    is_cancelled: bool
+    status: int  # exit status; negative for a signal
+    peak_gb: float  # largest resident memory that was seen [GB]
+    is_over_memory: bool  # it was stopped because it took more than it may
+    is_cancelled: bool  # it was stopped because nobody wants its result
 
 
 def run_child(order: Order, is_cancelled: Callable[[], bool]) -> ChildEnd:

@@ -18,57 +18,33 @@ class Ending(Enum):
 
 @dataclasses.dataclass(frozen=True)
 class Order:
-    """A task as a worker gets it.
+    """A task as a worker gets it."""
 
-    Attributes:
-        title: Stage and name.
-        script: Commands; `<RESULT_FOLDER>` stands for the hidden folder that an attempt writes to.
-        flags: Lasting flags, `--name=value`.
-        inputs: Map folders that it reads.
-        folder: Folder in which the program runs; relative paths in commands are relative to it.
-        result: Folder that the new result replaces; None where the commands save their input.
-        log: File to which its notes and errors are appended.
-        reports: File to which its reports are written, one line of JSON per command.
-        version: Version of maplab-py that must run it.
-        memory_gb: It is stopped when it takes more [GB]; 0 = no limit.
-        threads: Threads that it may use; 0 = the processors divided by `tasks_per_host`.
-        tasks_per_host: Tasks that run on a machine at the same time.
-        keep_going: Go on after a command that fails.
-        discard: The maps may be left unsaved.
-    """
-
-    title: str
+    title: str  # stage and name
+    # commands; `<RESULT_FOLDER>` stands for the hidden folder that an attempt writes to
     script: str
-    flags: tuple[str, ...]
-    inputs: tuple[Path, ...]
-    folder: Path
+    flags: tuple[str, ...]  # lasting flags, `--name=value`
+    inputs: tuple[Path, ...]  # map folders that it reads
+    folder: Path  # folder in which the program runs; relative paths in commands are relative to it
+    # folder that the new result replaces; None where the commands save their input
     result: Path | None
-    log: Path
-    reports: Path
-    version: str
-    memory_gb: float
-    threads: int
-    tasks_per_host: int
-    keep_going: bool
-    discard: bool
+    log: Path  # file to which its notes and errors are appended
+    reports: Path  # file to which its reports are written, one line of JSON per command
+    version: str  # version of maplab-py that must run it
+    memory_gb: float  # it is stopped when it takes more [GB]; 0 = no limit
+    threads: int  # threads that it may use; 0 = the processors divided by `tasks_per_host`
+    tasks_per_host: int  # tasks that run on a machine at the same time
+    keep_going: bool  # go on after a command that fails
+    discard: bool  # the maps may be left unsaved
 
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """Result of an order.
+    """Result of an order."""
 
-    Attributes:
-        title: Stage and name of the task.
-        ending: How it ended.
-        error: One line, empty where it is done.
-        seconds: Run time [s].
-        peak_gb: Largest resident memory [GB]; 0 where the system does not tell.
-        worker: Who ran it.
-    """
-
-    title: str
-    ending: Ending
-    error: str = ""
-    seconds: float = 0.0
-    peak_gb: float = 0.0
-    worker: str = ""
+    title: str  # stage and name of the task
+    ending: Ending  # how it ended
+    error: str = ""  # one line, empty where it is done
+    seconds: float = 0.0  # run time [s]
+    peak_gb: float = 0.0  # largest resident memory [GB]; 0 where the system does not tell
+    worker: str = ""  # who ran it

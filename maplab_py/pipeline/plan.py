@@ -18,22 +18,16 @@ _NAME = re.compile(r"[a-z0-9][a-z0-9_]*")
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """Commands that are run once per map (`each`), or once on several maps together (`all`).
+    """Commands that are run once per map (`each`), or once on several maps together (`all`)."""
 
-    Attributes:
-        name: Letters, digits and underscores; the results lie in a folder of this name.
-        commands: Lines of the console. `<CURRENT_VIMAP_FOLDER>` is the map's folder; with `all`, a line
-            that names it is repeated for every map. `<RESULT_FOLDER>` is the folder of the result.
-        each: A task per map of this stage; `maps` for the maps that the pipeline starts from.
-        all: One task with all maps of these stages, in their order.
-        memory_gb: Most memory of a task [GB]; 0 = what the scheduler allows.
-    """
-
-    name: str
+    name: str  # letters, digits and underscores; the results lie in a folder of this name
+    # lines of the console. `<CURRENT_VIMAP_FOLDER>` is the map's folder; with `all`, a line that names it is
+    # repeated for every map. `<RESULT_FOLDER>` is the folder of the result
     commands: tuple[str, ...]
+    # a task per map of this stage; `maps` for the maps that the pipeline starts from
     each: str = ""
-    all: tuple[str, ...] = ()
-    memory_gb: float = 0.0
+    all: tuple[str, ...] = ()  # one task with all maps of these stages, in their order
+    memory_gb: float = 0.0  # most memory of a task [GB]; 0 = what the scheduler allows
 
     @property
     def sources(self) -> tuple[str, ...]:
@@ -43,17 +37,11 @@ class Stage:
 
 @dataclasses.dataclass(frozen=True)
 class Pipeline:
-    """Stages over map folders.
+    """Stages over map folders."""
 
-    Attributes:
-        origin: File that described it, for messages.
-        maps: Map folders to start from.
-        stages: In any order.
-    """
-
-    origin: str
-    maps: tuple[Path, ...]
-    stages: tuple[Stage, ...]
+    origin: str  # file that described it, for messages
+    maps: tuple[Path, ...]  # map folders to start from
+    stages: tuple[Stage, ...]  # in any order
 
     @property
     def is_in_place(self) -> bool:

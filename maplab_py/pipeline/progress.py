@@ -66,12 +66,8 @@ class PipelineReport(Report):
 
 @dataclasses.dataclass(frozen=True)
 class Watcher:
-    """Functions that hear of a running pipeline; both do nothing by default.
+    """Functions that hear of a running pipeline; both do nothing by default."""
 
-    Attributes:
-        line: Gets a line for the user.
-        states: Gets the stages whenever something changes.
-    """
-
-    line: Callable[[str], None] = lambda _: None
+    line: Callable[[str], None] = lambda _: None  # gets a line for the user
+    # gets the stages whenever something changes
     states: Callable[[list[StageState]], None] = lambda _: None

@@ -23,35 +23,21 @@ _FORMAT = 1
 
 @dataclasses.dataclass(frozen=True)
 class Record:
-    """A finished task.
+    """A finished task."""
 
-    Attributes:
-        format: Version of the record.
-        stage: Name of its stage.
-        name: Name of the task.
-        commands: Commands of its stage, before folders are put in.
-        flags: Lasting flags by name.
-        version: Version of maplab-py.
-        inputs: Map folders that it read, in their order, each with its SHA-256.
-        result: SHA-256 of the result.
-        seconds: Run time [s].
-        peak_gb: Largest resident memory [GB].
-        attempts: How often it was started.
-        worker: Who finished it.
-    """
-
-    format: int
-    stage: str
-    name: str
-    commands: tuple[str, ...]
-    flags: dict[str, str]
-    version: str
+    format: int  # version of the record
+    stage: str  # name of its stage
+    name: str  # name of the task
+    commands: tuple[str, ...]  # commands of its stage, before folders are put in
+    flags: dict[str, str]  # lasting flags by name
+    version: str  # version of maplab-py
+    # map folders that it read, in their order, each with its SHA-256
     inputs: tuple[tuple[str, str], ...]
-    result: str
-    seconds: float
-    peak_gb: float
-    attempts: int
-    worker: str
+    result: str  # SHA-256 of the result
+    seconds: float  # run time [s]
+    peak_gb: float  # largest resident memory [GB]
+    attempts: int  # how often it was started
+    worker: str  # who finished it
 
 
 def record_of(task: Task, flags: dict[str, str], version: str) -> Record:
@@ -165,27 +151,16 @@ def _given(text: str | None) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """Commands on map folders.
+    """Commands on map folders."""
 
-    Attributes:
-        stage: Name of its stage.
-        name: Unique in the stage; the result's folder is called so.
-        inputs: Map folders that it reads.
-        commands: Commands of its stage.
-        lines: The same with the inputs put in; `<RESULT_FOLDER>` is not replaced yet.
-        result: Folder that it writes.
-        edits_input: The result is the map itself, which the commands save.
-        memory_gb: Most memory [GB]; 0 = no limit of its own.
-    """
-
-    stage: str
-    name: str
-    inputs: tuple[Path, ...]
-    commands: tuple[str, ...]
-    lines: tuple[str, ...]
-    result: Path
-    edits_input: bool
-    memory_gb: float
+    stage: str  # name of its stage
+    name: str  # unique in the stage; the result's folder is called so
+    inputs: tuple[Path, ...]  # map folders that it reads
+    commands: tuple[str, ...]  # commands of its stage
+    lines: tuple[str, ...]  # the same with the inputs put in; `<RESULT_FOLDER>` is not replaced yet
+    result: Path  # folder that it writes
+    edits_input: bool  # the result is the map itself, which the commands save
+    memory_gb: float  # most memory [GB]; 0 = no limit of its own
 
     @property
     def title(self) -> str:

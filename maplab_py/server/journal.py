@@ -41,25 +41,16 @@ class MergedSubmap:
 
 @dataclasses.dataclass(frozen=True)
 class Journal:
-    """State of a server.
+    """State of a server."""
 
-    Attributes:
-        merged: Submaps in the map, in the order in which they were merged.
-        robots: Robot of each mission (id).
-        deleted: Missions (ids) that were deleted; their submaps are refused.
-        since_joint: Submaps that were merged since the last joint optimisation.
-        since_reset: Submaps that were merged since the trust region was reset.
-        joint_is_due: A joint optimisation is needed at the next pause.
-        radius: Trust region of the last joint optimisation; 0 = the default.
-    """
-
+    # submaps in the map, in the order in which they were merged
     merged: tuple[MergedSubmap, ...] = ()
-    robots: dict[str, str] = dataclasses.field(default_factory=dict)
-    deleted: tuple[str, ...] = ()
-    since_joint: int = 0
-    since_reset: int = 0
-    joint_is_due: bool = False
-    radius: float = 0.0
+    robots: dict[str, str] = dataclasses.field(default_factory=dict)  # robot of each mission (id)
+    deleted: tuple[str, ...] = ()  # missions (ids) that were deleted; their submaps are refused
+    since_joint: int = 0  # submaps that were merged since the last joint optimisation
+    since_reset: int = 0  # submaps that were merged since the trust region was reset
+    joint_is_due: bool = False  # a joint optimisation is needed at the next pause
+    radius: float = 0.0  # trust region of the last joint optimisation; 0 = the default
 
     def with_merged(self, submap: MergedSubmap, *, joint_is_due: bool = False) -> Journal:
         """Return the journal after a submap has been merged."""
@@ -120,19 +111,12 @@ def write_journal(journal: Journal, path: Path) -> None:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Recovered:
-    """State at which the server continues.
+    """State at which the server continues."""
 
-    Attributes:
-        vi_map: The published map; None without one.
-        journal: What it consists of.
-        notes: What was brought to agree.
-        is_changed: The map was changed and must be published.
-    """
-
-    vi_map: VIMap | None
-    journal: Journal
-    notes: tuple[str, ...]
-    is_changed: bool
+    vi_map: VIMap | None  # the published map; None without one
+    journal: Journal  # what it consists of
+    notes: tuple[str, ...]  # what was brought to agree
+    is_changed: bool  # the map was changed and must be published
 
 
 def recover(spool: Spool, map_folder: Path) -> Recovered:

@@ -82,36 +82,22 @@ class MergeSteps:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _NewPart:
-    """Contents of a submap, and the scope of its search for loops.
+    """Contents of a submap, and the scope of its search for loops."""
 
-    Attributes:
-        stretches: Of its missions.
-        rows: Its vertices in the map.
-        part: They and their surroundings.
-        searched: Numbers of the submaps in the part, the new ones last.
-        frequencies: Of the words (W,) of the submap.
-    """
-
-    stretches: list[Stretch]
-    rows: I64
-    part: excerpts.Excerpt
-    searched: list[int]
-    frequencies: F64
+    stretches: list[Stretch]  # of its missions
+    rows: I64  # its vertices in the map
+    part: excerpts.Excerpt  # they and their surroundings
+    searched: list[int]  # numbers of the submaps in the part, the new ones last
+    frequencies: F64  # of the words (W,) of the submap
 
 
 @dataclasses.dataclass(frozen=True)
 class _ClosedLoops:
-    """Outcome of the loops of a submap.
+    """Outcome of the loops of a submap."""
 
-    Attributes:
-        landmarks_merged: Landmarks that became one.
-        has_large_gap: Some do not meet: a joint optimisation is needed.
-        note: Why no loops could be looked for.
-    """
-
-    landmarks_merged: int = 0
-    has_large_gap: bool = False
-    note: str = ""
+    landmarks_merged: int = 0  # landmarks that became one
+    has_large_gap: bool = False  # some do not meet: a joint optimisation is needed
+    note: str = ""  # why no loops could be looked for
 
 
 class Merger:

@@ -212,25 +212,15 @@ _SECONDS_BETWEEN_RETRIES = 5.0
 
 @dataclasses.dataclass
 class Item:
-    """An accepted submap that is not published yet.
+    """An accepted submap that is not published yet."""
 
-    Attributes:
-        entry: Where it is in the spool.
-        future: The worker that prepares it.
-        attempts: How often a worker has been started.
-        submap: The prepared submap, until it is merged.
-        waits_for_neighbour: It adjoins nothing of its mission in the map.
-        merged: Its record, from the merge on.
-        not_before_s: When its next worker may start [s, monotonic].
-    """
-
-    entry: Entry
-    future: Future[Outcome] | None = None
-    attempts: int = 0
-    submap: VIMap | None = None
-    waits_for_neighbour: bool = False
-    merged: MergedSubmap | None = None
-    not_before_s: float = 0.0
+    entry: Entry  # where it is in the spool
+    future: Future[Outcome] | None = None  # the worker that prepares it
+    attempts: int = 0  # how often a worker has been started
+    submap: VIMap | None = None  # the prepared submap, until it is merged
+    waits_for_neighbour: bool = False  # it adjoins nothing of its mission in the map
+    merged: MergedSubmap | None = None  # its record, from the merge on
+    not_before_s: float = 0.0  # when its next worker may start [s, monotonic]
 
     @property
     def needs_worker(self) -> bool:

@@ -41,21 +41,13 @@ long [s]: it may still be being copied."""
 
 @dataclasses.dataclass(frozen=True)
 class Entry:
-    """A submap in the spool.
+    """A submap in the spool."""
 
-    Attributes:
-        number: Counts the accepted submaps.
-        robot: Who sent it.
-        name: Name of its folder in `incoming/ROBOT`.
-        sha256: Of the names and contents of its files.
-        accepted_s: When it was accepted [s since 1970].
-    """
-
-    number: int
-    robot: str
-    name: str
-    sha256: str
-    accepted_s: float
+    number: int  # counts the accepted submaps
+    robot: str  # who sent it
+    name: str  # name of its folder in `incoming/ROBOT`
+    sha256: str  # of the names and contents of its files
+    accepted_s: float  # when it was accepted [s since 1970]
 
     @property
     def title(self) -> str:

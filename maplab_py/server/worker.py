@@ -25,27 +25,16 @@ _FORMAT = "%(asctime)s  process %(process)d  %(message)s"
 
 @dataclasses.dataclass(frozen=True)
 class SubmapOrder:
-    """A submap as a worker gets it, and what its result depends on.
+    """A submap as a worker gets it, and what its result depends on."""
 
-    Attributes:
-        title: Robot and name.
-        submap: Folder of the submap as it came.
-        result: Folder that gets the prepared submap, replaced as a whole.
-        log: File to which notes and errors are appended.
-        absolute_pose_gate_sigma: See `VIOptimizationOptions`.
-        ties_stationary: Whether the ends of a submap that stands still are tied.
-        max_rotation_rad: See `StationaryOptions`.
-        max_translation_m: Likewise.
-    """
-
-    title: str
-    submap: Path
-    result: Path
-    log: Path
-    absolute_pose_gate_sigma: float
-    ties_stationary: bool
-    max_rotation_rad: float
-    max_translation_m: float
+    title: str  # robot and name
+    submap: Path  # folder of the submap as it came
+    result: Path  # folder that gets the prepared submap, replaced as a whole
+    log: Path  # file to which notes and errors are appended
+    absolute_pose_gate_sigma: float  # see `VIOptimizationOptions`
+    ties_stationary: bool  # whether the ends of a submap that stands still are tied
+    max_rotation_rad: float  # see `StationaryOptions`
+    max_translation_m: float  # likewise
 
     def as_line(self) -> str:
         """Return the order as a line of JSON."""

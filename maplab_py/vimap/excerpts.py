@@ -15,23 +15,14 @@ from maplab_py.vimap.vi_map import VIMap
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Excerpt:
-    """A part of a map.
+    """A part of a map."""
 
-    Attributes:
-        source: The whole map.
-        vi_map: The part, with the ids of the whole.
-        missions: Its missions as rows of the whole.
-        vertices: Its vertices likewise.
-        landmarks: Its landmarks likewise.
-        keypoints: Its keypoints likewise.
-    """
-
-    source: VIMap
-    vi_map: VIMap
-    missions: I64
-    vertices: I64
-    landmarks: I64
-    keypoints: I64
+    source: VIMap  # the whole map
+    vi_map: VIMap  # the part, with the ids of the whole
+    missions: I64  # its missions as rows of the whole
+    vertices: I64  # its vertices likewise
+    landmarks: I64  # its landmarks likewise
+    keypoints: I64  # its keypoints likewise
 
     def written_back(self, edited: VIMap, *, vertices: ArrayLike | None = None) -> VIMap:
         """Return the whole map with the states and landmarks of the edited part.

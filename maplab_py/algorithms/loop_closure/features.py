@@ -388,12 +388,9 @@ class ProjectionMemory:
 
 @dataclasses.dataclass(frozen=True)
 class SearchScope:
-    """Limits of a search.
+    """Limits of a search."""
 
-    Attributes:
-        queries: Vertices (V,) whose places are looked for, in the whole map; None = all.
-        projections: Keeps the projection from one search to the next; None = it is learned.
-    """
-
+    # vertices (V,) whose places are looked for, in the whole map; None = all
     queries: Mask | None = None
+    # keeps the projection from one search to the next; None = it is learned
     projections: ProjectionMemory | None = None

@@ -193,17 +193,11 @@ class Fate(enum.Enum):
 
 @dataclasses.dataclass(frozen=True)
 class FormerFlag:
-    """One flag of maplab.
+    """One flag of maplab."""
 
-    Attributes:
-        fate: What became of it.
-        new_name: Its name here without dashes; empty for a dropped one.
-        note: How the new one differs, may be empty; why it was dropped.
-    """
-
-    fate: Fate
-    new_name: str
-    note: str
+    fate: Fate  # what became of it
+    new_name: str  # its name here without dashes; empty for a dropped one
+    note: str  # how the new one differs, may be empty; why it was dropped
 
 
 def former_flags() -> dict[str, FormerFlag]:

@@ -77,15 +77,12 @@ class OrderingKind(Enum):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Ordering:
-    """Orders the nodes of a pattern.
+    """Orders the nodes of a pattern."""
 
-    Attributes:
-        kind: Algorithm; AUTO takes the order of fewer predicted operations.
-        position_m: Position (num_nodes, 3) of every node, not-a-number = none: nested dissection cuts
-            there where METIS is not installed.
-    """
-
+    # algorithm; AUTO takes the order of fewer predicted operations
     kind: OrderingKind = OrderingKind.AUTO
+    # position (num_nodes, 3) of every node, not-a-number = none: nested dissection cuts there where METIS is
+    # not installed
     position_m: F64 | None = None
 
     def __call__(self, pattern: BlockPattern) -> I64:

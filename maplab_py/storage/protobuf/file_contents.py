@@ -19,20 +19,13 @@ Words = list[list[int]]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FileContent:
-    """A file of a map before it is written.
+    """A file of a map before it is written."""
 
-    Attributes:
-        kind: Kind of its entities (proto value).
-        name: Name of the file.
-        columns: All that it says.
-        to_bytes: Makes the bytes of the file of nothing but the columns.
-        measurements: Names of the columns that are contiguous parts of the map's own and seldom change.
-    """
-
-    kind: int
-    name: str
-    columns: Columns
-    to_bytes: Callable[[Columns], bytes]
+    kind: int  # kind of its entities (proto value)
+    name: str  # name of the file
+    columns: Columns  # all that it says
+    to_bytes: Callable[[Columns], bytes]  # makes the bytes of the file of nothing but the columns
+    # names of the columns that are contiguous parts of the map's own and seldom change
     measurements: tuple[str, ...] = ()
 
     def data(self) -> bytes:
@@ -56,15 +49,10 @@ class FileContent:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Groups:
-    """Rows of a table grouped by the rows of another one.
+    """Rows of a table grouped by the rows of another one."""
 
-    Attributes:
-        order: The rows, group after group, in their order within a group.
-        start: Offsets (groups + 1) into `order`.
-    """
-
-    order: I64
-    start: I64
+    order: I64  # the rows, group after group, in their order within a group
+    start: I64  # offsets (groups + 1) into `order`
 
     @classmethod
     def of(cls, keys: NDArray[Any], count: int) -> Groups:

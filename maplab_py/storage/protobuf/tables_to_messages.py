@@ -17,17 +17,12 @@ from maplab_py.vimap import ResourceOwner, TransformationKind, VIMap, is_valid, 
 
 @dataclasses.dataclass(frozen=True)
 class Partition:
-    """Division of entities into files. The default is that of C++ maplab.
+    """Division of entities into files. The default is that of C++ maplab."""
 
-    Attributes:
-        vertices: Most vertices of a file.
-        edges: Most edges of a file.
-        is_stable: Vertices of two missions are in different files, and edges of two kinds. The
-            files of a mission then do not change when another one grows.
-    """
-
-    vertices: int = 50
-    edges: int = 30_000
+    vertices: int = 50  # most vertices of a file
+    edges: int = 30_000  # most edges of a file
+    # vertices of two missions are in different files, and edges of two kinds. The files of a mission then do
+    # not change when another one grows
     is_stable: bool = False
 
     def vertex_rows(self, vi_map: VIMap) -> list[range]:

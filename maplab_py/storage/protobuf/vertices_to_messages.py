@@ -35,15 +35,10 @@ _WORD_TAG = pb.Id.DESCRIPTOR.fields_by_name["words"].number << 3
 
 @dataclasses.dataclass(frozen=True)
 class IdFields:
-    """The bytes of ids in a repeated field.
+    """The bytes of ids in a repeated field."""
 
-    Attributes:
-        data: The bytes of all of them.
-        start: Offsets (N + 1) into them.
-    """
-
-    data: bytes
-    start: list[int]
+    data: bytes  # the bytes of all of them
+    start: list[int]  # offsets (N + 1) into them
 
     def of(self, rows: slice) -> bytes:
         """Return the bytes of consecutive ids."""
