@@ -1,6 +1,7 @@
 """Reports: results of an algorithm as small dataclasses of numbers that a user would ask for."""
 
 import dataclasses
+import functools
 import html
 import json
 from collections.abc import Mapping
@@ -80,6 +81,23 @@ class Message(Report):
     def as_text(self) -> str:
         """Return the sentence."""
         return self.text
+
+
+@functools.cache
+def _view_type(names: tuple[str, ...], headings: tuple[tuple[str, str], ...]) -> type[Any]:
+    metadata = {name: {"title": text} for name, text in headings} | {"summary": {"is_prose": True}}
+    fields = [(name, Any, dataclasses.field(metadata=metadata.get(name))) for name in names]
+    return dataclasses.make_dataclass("View", fields, frozen=True)
+
+
+def view(headings: Mapping[str, str] | None = None, /, **values: Any) -> Any:
+    """Return values as a dataclass for `Report.display`; a `summary` is shown as a sentence.
+
+    Args:
+        headings: Headings of fields, instead of those that follow from their names; empty = none.
+        values: The values by name, in the order in which they are shown.
+    """
+    return _view_type(tuple(values), tuple((headings or {}).items()))(**values)
 
 
 def counted(count: int, singular: str, plural: str = "") -> str:

@@ -18,12 +18,18 @@ from maplab_py.algorithms.loop_closure import closure_record, listing
 from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
 from maplab_py.algorithms.loop_closure.reports import Verdict as ClosureVerdict
 from maplab_py.algorithms.recording_check.doctor import map_findings
-from maplab_py.algorithms.recording_check.findings import Check, Finding, Verdict, cause
+from maplab_py.algorithms.recording_check.findings import (
+    Check,
+    Finding,
+    Verdict,
+    cause,
+    remedies,
+)
 from maplab_py.algorithms.scale_check import mission_scales
 from maplab_py.array_types import F64
 from maplab_py.estimation.imu.inertial_data import InertialData
 from maplab_py.progress import SILENT, Progress
-from maplab_py.report import Report, counted
+from maplab_py.report import Report, counted, view
 from maplab_py.vimap import LandmarkQuality, VIMap, consistency, queries
 
 _LIGHTS = {
@@ -61,12 +67,6 @@ class Light:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Page(Report):
-    lights: tuple[Light, ...]
-    remedies: tuple[str, ...]
-
-
-@dataclasses.dataclass(frozen=True)
 class MapHealth(Report):
     """Findings on a map, causes before effects."""
 
@@ -94,8 +94,7 @@ class MapHealth(Report):
 
     def display(self) -> Any:
         """Return the lights, with the remedies below them."""
-        remedies = tuple(f"{f.check}: {f.remedy}" for f in self.findings if f.remedy)
-        return _Page(self.lights, remedies)
+        return view(lights=self.lights, remedies=remedies(self.findings))
 
     def as_html(self) -> str:
         """Return the page as HTML that needs no network."""

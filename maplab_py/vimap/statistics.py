@@ -9,7 +9,7 @@ import numpy as np
 
 from maplab_py.array_types import NDArray
 from maplab_py.distinct import distinct
-from maplab_py.report import Report, counted
+from maplab_py.report import Report, counted, view
 from maplab_py.vimap import queries
 from maplab_py.vimap.ids import distinct_prefixes, is_valid, to_hex, to_hex_list
 from maplab_py.vimap.tables import Backbone, LandmarkQuality, ResourceOwner, TransformationKind
@@ -74,30 +74,6 @@ class MapTotals:
 
 
 @dataclasses.dataclass(frozen=True)
-class MissionLine:
-    """One mission as it is shown."""
-
-    mission: str
-    id: str
-    length_m: float | None
-    duration_s: float | None = dataclasses.field(metadata={"title": "duration", "unit": "s"})
-    vertices: int
-    good: int  # landmarks; the line below the table says so, longer heads leave no room for names
-    bad: int
-    unknown: int | str  # empty: there are none in the map
-    closures: int | None
-    known: str
-
-
-@dataclasses.dataclass(frozen=True)
-class MissionTable:
-    """Summary of the statistics."""
-
-    missions: tuple[MissionLine, ...] = dataclasses.field(metadata={"title": ""})
-    summary: str = dataclasses.field(metadata={"is_prose": True})
-
-
-@dataclasses.dataclass(frozen=True)
 class MapStatistics(Report):
     """Report of `map_stats`."""
 
@@ -110,17 +86,18 @@ class MapStatistics(Report):
         has_unknown = any(mission.landmarks_unknown for mission in self.missions)
         ids = distinct_prefixes([mission.id for mission in self.missions])
         lines = [
-            MissionLine(
-                mission.name or mission.id,
-                id_,
-                mission.distance_m,
-                mission.duration_s,
-                mission.vertices,
-                mission.landmarks_good,
-                mission.landmarks_bad,
-                mission.landmarks_unknown if has_unknown else "",
-                mission.closures,
-                "yes" if mission.T_G_M_known else "no",
+            view(
+                mission=mission.name or mission.id,
+                id=id_,
+                length_m=mission.distance_m,
+                duration_s=mission.duration_s,
+                vertices=mission.vertices,
+                # landmarks; the summary says so, longer heads leave no room for names
+                good=mission.landmarks_good,
+                bad=mission.landmarks_bad,
+                unknown=mission.landmarks_unknown if has_unknown else "",
+                closures=mission.closures,
+                known="yes" if mission.T_G_M_known else "no",
             )
             for mission, id_ in zip(self.missions, ids, strict=True)
         ]
@@ -133,7 +110,7 @@ class MapStatistics(Report):
                 f"{self.total.landmarks_good} good, {self.total.landmarks_bad} bad, "
                 f"{self.total.landmarks_unknown} unknown; {summary}"
             )
-        return MissionTable(tuple(lines), summary)
+        return view({"missions": ""}, missions=lines, summary=summary)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,7 +130,7 @@ class CoobservabilityReport(Report):
     clusters: tuple[tuple[str, ...], ...]
     shared_landmarks: tuple[tuple[int, ...], ...]  # [i][j]: landmarks that missions i and j observe
 
-    def display(self) -> CoobservabilityTable:
+    def display(self) -> Any:
         """Return one row per mission."""
         cluster = {name: number for number, names in enumerate(self.clusters) for name in names}
         lines = []
@@ -164,27 +141,17 @@ class CoobservabilityReport(Report):
                 key=lambda other: (-counts[other], other),
             )
             shared = ", ".join(f"{self.missions[other]}: {counts[other]}" for other in others)
+            group = cluster[mission] + 1
             lines.append(
-                CoobservabilityLine(mission, cluster[mission] + 1, counts[row], shared or "none")
+                view(
+                    {"shared": "shared with"},
+                    mission=mission,
+                    group=group,
+                    landmarks=counts[row],
+                    shared=shared or "none",
+                )
             )
-        return CoobservabilityTable(tuple(lines))
-
-
-@dataclasses.dataclass(frozen=True)
-class CoobservabilityLine:
-    """The landmarks of one mission as they are shown."""
-
-    mission: str
-    group: int
-    landmarks: int
-    shared: str = dataclasses.field(metadata={"title": "shared with"})
-
-
-@dataclasses.dataclass(frozen=True)
-class CoobservabilityTable:
-    """Summary of the landmarks that missions share."""
-
-    missions: tuple[CoobservabilityLine, ...] = dataclasses.field(metadata={"title": ""})
+        return view({"missions": ""}, missions=lines)
 
 
 def map_statistics(vi_map: VIMap) -> MapStatistics:

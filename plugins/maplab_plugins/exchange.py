@@ -17,6 +17,7 @@ from maplab_py.plugin import (
     command,
     write_text,
 )
+from maplab_py.report import view
 
 if TYPE_CHECKING:
     from maplab_py.algorithms.self_calibration.reports import ComparedParameter
@@ -49,19 +50,6 @@ class ReadParameter:
 
 
 @dataclasses.dataclass(frozen=True)
-class _ShownParameter:
-    parameter: str
-    value: str
-    unit: str
-
-
-def _as_shown(row: ReadParameter | _ShownParameter) -> _ShownParameter:
-    if isinstance(row, _ShownParameter):  # a shown report is laid out, too
-        return row
-    return _ShownParameter(row.parameter, f"{row.value + 0.0:.6g}", row.unit)
-
-
-@dataclasses.dataclass(frozen=True)
 class CalibrationImport(Report):
     """Contents of a calibration file, and their use."""
 
@@ -75,10 +63,14 @@ class CalibrationImport(Report):
     sensors_file: Path | None = None  # that was written
     changes: tuple[ComparedParameter, ...] = ()  # of the map's device
 
-    def display(self) -> CalibrationImport:
+    def display(self) -> Any:
         """Return the report with six digits of numbers, and without what the changes say, too."""
-        shown: Any = () if self.changes else tuple(_as_shown(row) for row in self.parameters)
-        return dataclasses.replace(self, parameters=shown)
+        rows = () if self.changes else self.parameters
+        numbers = [
+            view(parameter=row.parameter, value=f"{row.value + 0.0:.6g}", unit=row.unit)
+            for row in rows
+        ]
+        return view(**vars(self) | {"parameters": numbers})
 
     @property
     def advice(self) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from maplab_py.algorithms.loop_closure.options import FeatureTypeOptions, LoopCl
 from maplab_py.algorithms.map_update.options import EvidenceOptions
 from maplab_py.algorithms.relaxation.options import RelaxationOptions, RelaxationReport
 from maplab_py.plugin import CommandContext, Message, Report, UserError, command
-from maplab_py.report import counted
+from maplab_py.report import counted, view
 from maplab_py.vimap import to_hex_list
 
 if TYPE_CHECKING:
@@ -67,53 +67,27 @@ class RelaxMissionsReport(Report):
             return ""
         return "no mission was relaxed: " + "; ".join(failures)
 
-    def display(self) -> RelaxedMissionTable:
+    def display(self) -> Any:
         """Return one row per mission."""
-        return RelaxedMissionTable(
-            tuple(
-                RelaxedMissionLine(
-                    name,
-                    report.loop_closures.accepted,
-                    report.relaxation.num_loop_closures,
-                    report.relaxation.num_switched_off,
-                    report.relaxation.cost_before,
-                    report.relaxation.cost_after,
-                    report.relaxation.mean_correction_m,
-                    report.relaxation.max_correction_m,
-                    report.merging.landmarks_merged if report.merging else None,
+        lines, notes = [], []
+        for name, report in self.missions.items():
+            relaxed = report.relaxation
+            lines.append(
+                view(
+                    mission=name,
+                    accepted_closures=report.loop_closures.accepted,
+                    used=relaxed.num_loop_closures,
+                    switched_off=relaxed.num_switched_off,
+                    cost_before=relaxed.cost_before,
+                    cost_after=relaxed.cost_after,
+                    mean_correction_m=relaxed.mean_correction_m,
+                    max_correction_m=relaxed.max_correction_m,
+                    landmarks_merged=report.merging.landmarks_merged if report.merging else None,
                 )
-                for name, report in self.missions.items()
-            ),
-            tuple(
-                f"{name}: {note}"
-                for name, report in self.missions.items()
-                for note in (report.loop_closures.reason, *report.relaxation.notes)
-                if note
-            ),
-        )
-
-
-@dataclasses.dataclass(frozen=True)
-class RelaxedMissionLine:
-    """One relaxed mission as it is shown."""
-
-    mission: str
-    accepted: int = dataclasses.field(metadata={"title": "accepted closures"})
-    used: int
-    switched_off: int
-    cost_before: float
-    cost_after: float
-    mean_correction_m: float
-    max_correction_m: float
-    landmarks_merged: int | None
-
-
-@dataclasses.dataclass(frozen=True)
-class RelaxedMissionTable:
-    """Displayed results of missions that were relaxed independently."""
-
-    missions: tuple[RelaxedMissionLine, ...] = dataclasses.field(metadata={"title": ""})
-    notes: tuple[str, ...] = ()
+            )
+            texts = (report.loop_closures.reason, *relaxed.notes)
+            notes += [f"{name}: {text}" for text in texts if text]
+        return view({"missions": ""}, missions=lines, notes=notes)
 
 
 @command(

@@ -1,8 +1,9 @@
 """Report of trajectory evaluation."""
 
 import dataclasses
+from typing import Any
 
-from maplab_py.report import Report
+from maplab_py.report import Report, view
 
 _LARGEST_RATIO = 10.0
 """Larger changes are shown without percents."""
@@ -43,37 +44,6 @@ class BaselineErrors:
 
 
 @dataclasses.dataclass(frozen=True)
-class ErrorLine:
-    """One kind of error as it is shown."""
-
-    error: str
-    rmse: float = dataclasses.field(metadata={"title": "RMSE"})
-    median: float
-    max: float
-    change: str = ""  # of the RMSE since the baseline
-
-
-@dataclasses.dataclass(frozen=True)
-class MissionLine:
-    """The error of one mission that is aligned separately, as it is shown."""
-
-    mission: str
-    vertices: int
-    rmse: float | None = dataclasses.field(
-        metadata={"title": "APE RMSE, aligned alone", "unit": "m"}
-    )
-
-
-@dataclasses.dataclass(frozen=True)
-class ErrorTable:
-    """Summary of an evaluation."""
-
-    errors: tuple[ErrorLine, ...] = dataclasses.field(metadata={"title": ""})
-    missions: tuple[MissionLine, ...] = dataclasses.field(metadata={"title": ""})
-    summary: str = dataclasses.field(metadata={"is_prose": True})
-
-
-@dataclasses.dataclass(frozen=True)
 class TrajectoryEvaluationReport(Report):
     """Errors of the vertices against ground truth."""
 
@@ -107,7 +77,7 @@ class TrajectoryEvaluationReport(Report):
             None if self.rpe_deg is None else self.rpe_deg.rmse,
         )
 
-    def display(self) -> ErrorTable:
+    def display(self) -> Any:
         """Return one table of the errors and a sentence on how they were computed."""
         kinds = ("ape_m", "ape_deg", "ape_sim3_m", "rpe_m", "rpe_deg")
         names = ("APE [m]", "APE [deg]", "APE, Sim(3) [m]", "RPE [m]", "RPE [deg]")
@@ -117,12 +87,18 @@ class TrajectoryEvaluationReport(Report):
             if statistics is not None:
                 before = None if self.baseline is None else getattr(self.baseline, kind)
                 change = _change(statistics.rmse, before)
-                lines.append(
-                    ErrorLine(name, statistics.rmse, statistics.median, statistics.max, change)
-                )
-        missions = tuple(MissionLine(m.mission_id, m.matched, m.ape_rmse_m) for m in self.missions)
-        return ErrorTable(
-            tuple(lines), missions if len(missions) > 1 else (), " ".join(self._sentences())
+                numbers = {n: getattr(statistics, n) for n in ("rmse", "median", "max")}
+                lines.append(view(error=name, **numbers, change=change))
+        head = {"rmse": "APE RMSE, aligned alone [m]"}
+        missions = [
+            view(head, mission=m.mission_id, vertices=m.matched, rmse=m.ape_rmse_m)
+            for m in self.missions
+        ]
+        return view(
+            {"errors": "", "missions": ""},
+            errors=lines,
+            missions=missions if len(missions) > 1 else (),
+            summary=" ".join(self._sentences()),
         )
 
     def _sentences(self) -> list[str]:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 from enum import Enum
+from typing import Any
 
-from maplab_py.report import Report
+from maplab_py.report import Report, view
 
 
 class Verdict(Enum):
@@ -125,7 +126,7 @@ class ClosureReport(Report):
     closures: tuple[ClosureLine, ...]
     notes: tuple[str, ...] = ()
 
-    def display(self) -> ClosureTable:
+    def display(self) -> Any:
         """Return the closures with their verdicts in the first columns."""
         reasons = ", ".join(f"{count} {reason}" for reason, count in self.refused.items())
         summary = (
@@ -133,44 +134,12 @@ class ClosureReport(Report):
             f"{self.largest_gap_m:.3f} m; refused: {reasons or 'none'}; {self.shown} shown"
             + (f"; written to {self.file}" if self.file else "")
         )
-        names = [field.name for field in dataclasses.fields(ShownClosure)]
-        lines = tuple(
-            ShownClosure(**{name: getattr(line, name) for name in names}) for line in self.closures
+        names = (
+            "id query query_s place place_s inliers verdict weight gap_m correction_m matches "
+            "support ratio tilt_deg gap_deg correction_deg merged use"
         )
-        return ClosureTable(lines, summary, self.notes)
-
-
-@dataclasses.dataclass(frozen=True)
-class ShownClosure:
-    """A closure as it is shown."""
-
-    id: str
-    query: str
-    query_s: float
-    place: str
-    place_s: float
-    inliers: int
-    verdict: str
-    weight: float
-    gap_m: float
-    correction_m: float
-    matches: int
-    support: int
-    ratio: float
-    tilt_deg: float
-    gap_deg: float
-    correction_deg: float
-    merged: int
-    use: str
-
-
-@dataclasses.dataclass(frozen=True)
-class ClosureTable:
-    """Displayed columns of the recorded closures."""
-
-    closures: tuple[ShownClosure, ...] = dataclasses.field(metadata={"title": ""})
-    summary: str = dataclasses.field(metadata={"is_prose": True})
-    notes: tuple[str, ...] = ()
+        lines = [view(**{n: getattr(line, n) for n in names.split()}) for line in self.closures]
+        return view({"closures": ""}, closures=lines, summary=summary, notes=self.notes)
 
 
 @dataclasses.dataclass(frozen=True)

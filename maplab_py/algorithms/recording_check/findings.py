@@ -6,7 +6,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from maplab_py.report import Report
+from maplab_py.report import Report, view
 
 
 class Verdict(Enum):
@@ -83,25 +83,6 @@ def cause(findings: Sequence[Finding]) -> Finding | None:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Row:
-    check: str
-    observed: str
-    expected: str
-    verdict: str
-
-
-@dataclasses.dataclass(frozen=True)
-class _Shown(Report):
-    recording: str
-    duration_s: float
-    checked_images: int
-    findings: tuple[_Row, ...]
-    remedies: tuple[str, ...]
-    notes: tuple[str, ...]
-    sensors_file: Path | None
-
-
-@dataclasses.dataclass(frozen=True)
 class RecordingCheck(Report):
     """Findings on a recording, causes before effects."""
 
@@ -135,14 +116,21 @@ class RecordingCheck(Report):
 
     def display(self) -> Any:
         """Return the table, with the remedies below it."""
-        rows = tuple(_Row(f.check, f.observed, f.expected, f.verdict.value) for f in self.findings)
-        remedies = tuple(f"{f.check}: {f.remedy}" for f in self.findings if f.remedy)
-        return _Shown(
-            self.recording,
-            self.duration_s,
-            self.checked_images,
-            rows,
-            remedies,
-            self.notes,
-            self.sensors_file,
+        names = ("check", "observed", "expected")
+        return view(
+            recording=self.recording,
+            duration_s=self.duration_s,
+            checked_images=self.checked_images,
+            findings=[
+                view(**{n: getattr(f, n) for n in names}, verdict=f.verdict.value)
+                for f in self.findings
+            ],
+            remedies=remedies(self.findings),
+            notes=self.notes,
+            sensors_file=self.sensors_file,
         )
+
+
+def remedies(findings: Sequence[Finding]) -> list[str]:
+    """Return the remedies of findings with the names of their checks."""
+    return [f"{f.check}: {f.remedy}" for f in findings if f.remedy]

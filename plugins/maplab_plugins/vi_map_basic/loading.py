@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from maplab_py.input_files import SizeOptions
 from maplab_py.plugin import CommandContext, Message, Report, UserError, command, key_of_folder
-from maplab_py.report import counted
+from maplab_py.report import counted, view
 from maplab_py.storage.cache.options import CacheOptions
 
 if TYPE_CHECKING:
@@ -42,11 +42,11 @@ class LoadedMaps(Report):
     maps: tuple[LoadedMap, ...]
     details: tuple[Report, ...]
 
-    def display(self) -> Message | LoadedMapsTable:
+    def display(self) -> Any:
         """Return a sentence on one map, else a table."""
         notes = tuple(note for report in self.details for note in getattr(report, "notes", ()))
         if len(self.maps) != 1:
-            return LoadedMapsTable(self.maps, notes)
+            return view({"maps": ""}, maps=self.maps, notes=notes)
         (loaded,) = self.maps
         contents = (
             f"{counted(loaded.missions, 'mission')}, "
@@ -55,14 +55,6 @@ class LoadedMaps(Report):
         )
         sentence = f"map '{loaded.map_key}': {contents}, from {loaded.folder}"
         return Message("\n".join((sentence, *notes)))
-
-
-@dataclasses.dataclass(frozen=True)
-class LoadedMapsTable:
-    """Displayed results of several loaded maps."""
-
-    maps: tuple[LoadedMap, ...] = dataclasses.field(metadata={"title": ""})
-    notes: tuple[str, ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,29 +68,12 @@ class MergedMaps(Report):
     merged_folders: tuple[str, ...]
     details: tuple[Report, ...]
 
-    def display(self) -> MergedMapsTable:
+    def display(self) -> Any:
         """Return the result without what every single merge added."""
         notes = (note for report in self.details for note in getattr(report, "notes", ()))
-        return MergedMapsTable(
-            self.map_key,
-            self.missions,
-            self.vertices,
-            self.landmarks,
-            len(self.merged_folders),
-            tuple(dict.fromkeys(notes)),
-        )
-
-
-@dataclasses.dataclass(frozen=True)
-class MergedMapsTable:
-    """Displayed results of merged maps."""
-
-    map_key: str
-    missions: int
-    vertices: int
-    landmarks: int
-    merged_folders: int
-    notes: tuple[str, ...]
+        values = vars(self) | {"merged_folders": len(self.merged_folders)}
+        del values["details"]
+        return view(**values, notes=tuple(dict.fromkeys(notes)))
 
 
 class ReadingOptions(CacheOptions, SizeOptions):

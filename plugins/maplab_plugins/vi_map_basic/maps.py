@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from maplab_py.plugin import CommandContext, Message, Report, UserError, command
-from maplab_py.report import counted
+from maplab_py.report import counted, view
 from maplab_py.vimap import VIMap
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ class MapList(Report):
     selected: str
     maps: tuple[MapLine, ...]
 
-    def display(self) -> MapTable:
+    def display(self) -> Any:
         """Return one table in which the selected map is marked."""
         lines = tuple(
             dataclasses.replace(map_, state=f"selected, {map_.state}")
@@ -41,14 +41,7 @@ class MapList(Report):
             else map_
             for map_ in self.maps
         )
-        return MapTable(lines)
-
-
-@dataclasses.dataclass(frozen=True)
-class MapTable:
-    """Displayed results of the maps in memory."""
-
-    maps: tuple[MapLine, ...] = dataclasses.field(metadata={"title": ""})
+        return view({"maps": ""}, maps=lines)
 
 
 @command("list", "ls", "list_maps", needs_map=False)

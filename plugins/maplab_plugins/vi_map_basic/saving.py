@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 from maplab_py.errors import MaplabError
 from maplab_py.options import Options
 from maplab_py.plugin import CommandContext, Message, Report, UserError, command
+from maplab_py.report import view
 from maplab_py.storage.protobuf.descriptor_layout import LayoutChoice
 from maplab_py.storage.resources.files import ResourceMigration, delete_files
 
@@ -33,32 +35,14 @@ class SavedMaps(Report):
         """List what failed after the first map was saved."""
         return "; ".join(self.problems)
 
-    def display(self) -> SavedMapTable:
+    def display(self) -> Any:
         """Return one row per map."""
         written = [report.as_dict() for report in self.details]
-        return SavedMapTable(
-            tuple(
-                SavedMapLine(saved.map_key, saved.folder, files["files"], files["megabytes"])
-                for saved, files in zip(self.maps, written, strict=True)
-            )
-        )
-
-
-@dataclasses.dataclass(frozen=True)
-class SavedMapLine:
-    """One saved map as it is shown."""
-
-    map_key: str
-    folder: Path
-    files: int
-    megabytes: float
-
-
-@dataclasses.dataclass(frozen=True)
-class SavedMapTable:
-    """Displayed results of the saved maps."""
-
-    maps: tuple[SavedMapLine, ...] = dataclasses.field(metadata={"title": ""})
+        lines = [
+            view(**vars(saved), files=files["files"], megabytes=files["megabytes"])
+            for saved, files in zip(self.maps, written, strict=True)
+        ]
+        return view({"maps": ""}, maps=lines)
 
 
 @dataclasses.dataclass(frozen=True)
