@@ -284,12 +284,8 @@ def _database_seeds(folder: Path) -> list[bytes]:
 def _read_database(folder: Path, data: bytes) -> None:
     path = folder / "database.db"
     path.write_bytes(data)
-    database = features.ColmapDatabase(path)
-    try:
-        for name, uv in _keypoints_of(_prepared(folder, "database", _database_seeds)):
-            database.features(name, uv)
-    finally:
-        database.close()
+    images = _keypoints_of(_prepared(folder, "database", _database_seeds))
+    list(features.features_of_images(path, *zip(*images, strict=True)))
 
 
 def _keypoints_of(folder: Path) -> list[tuple[str, np.ndarray]]:

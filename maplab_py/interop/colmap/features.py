@@ -1,13 +1,16 @@
 """Descriptors, scales and images of an imported model, from COLMAP's database and image folders."""
 
+import contextlib
 import dataclasses
 import sqlite3
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 from urllib.request import pathname2url
 
 import numpy as np
 
-from maplab_py.array_types import F64, U8
+from maplab_py.array_types import F64, U8, NDArray
 from maplab_py.errors import MapError, UserError
 from maplab_py.input_files import read_bytes
 from maplab_py.progress import SILENT, Progress
@@ -26,7 +29,6 @@ _LEAST_SCALED, _LEAST_UNDISTORTED = 6, 60
 """Keypoints that tell a fit with 2 numbers an axis, or with 21, from chance."""
 _FEW_SHARE = 0.05
 """Of the extent: how far half of too few keypoints for such a fit may lie apart."""
-_REMEDY = "copy it again, or import without --database"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -42,107 +44,105 @@ class ImageFeatures:
 _LARGEST_KEYPOINT = 1e7
 """Of pixels and scales; a file that is damaged has others, and numbers that are none."""
 
-_DAMAGES = (sqlite3.Error, UnicodeDecodeError, MemoryError)
-"""Raised by sqlite for a damaged file; MemoryError where sizes in it are huge."""
+_DAMAGES = (sqlite3.Error, ValueError, MemoryError)
+"""Of a damaged file; MemoryError where sizes in it are huge."""
 
 
-class ColmapDatabase:
-    """A database, opened for reading only."""
+_QUERY = """
+    SELECT k.rows, k.cols, k.data, {kind}, d.rows, d.cols, d.data
+    FROM images AS i LEFT JOIN keypoints AS k ON k.image_id = i.image_id
+    LEFT JOIN descriptors AS d ON d.image_id = i.image_id WHERE i.name = ?
+"""
 
-    def __init__(self, path: Path) -> None:
-        """Open the database.
 
-        Raises:
-            UserError: There is no such file.
-            MapError: It is no database of COLMAP.
-        """
-        if not path.is_file():
-            raise UserError(f"--database={path}: no such file")
-        self.path = path
-        try:
-            uri = f"file:{pathname2url(str(path.absolute()))}?mode=ro"
-            self._connection = sqlite3.connect(uri, uri=True)
-            self._id_of = dict(self._connection.execute("SELECT name, image_id FROM images"))
-            columns = self._connection.execute("PRAGMA table_info(descriptors)").fetchall()
-        except _DAMAGES as error:
-            raise self._damaged(str(error) or "its sizes make no sense") from error
-        self._has_types = any(column[1] == "type" for column in columns)
+def features_of_images(
+    path: Path, names: Sequence[str], uv: Sequence[F64], progress: Progress = SILENT
+) -> Iterator[ImageFeatures]:
+    """Yield the features of images in a database, which is opened for reading only.
 
-    def close(self) -> None:
-        """Close the database."""
-        self._connection.close()
+    Args:
+        names: Names of the images.
+        uv: Keypoints (K, 2) of each image in the model, in COLMAP's pixels.
 
-    def features(self, name: str, uv: F64) -> ImageFeatures:
-        """Return the features of an image.
+    Raises:
+        UserError: There is no such file.
+        MapError: It is damaged or no database of COLMAP, or an image is not there or has other keypoints.
+    """
+    if not path.is_file():
+        raise UserError(f"--database={path}: no such file")
+    uri = f"file:{pathname2url(str(path.absolute()))}?mode=ro"
+    try:
+        with contextlib.closing(sqlite3.connect(uri, uri=True)) as connection:
+            columns = connection.execute("PRAGMA table_info(descriptors)").fetchall()
+            has_types = any(column[1] == "type" for column in columns)
+            query = _QUERY.format(kind="d.type" if has_types else _SIFT)
+            for row, (name, of_model) in enumerate(zip(names, uv, strict=True)):
+                progress.step(row, len(names), "descriptors")
+                stored = connection.execute(query, (name,)).fetchone()
+                if stored is None:
+                    raise MapError(f"{path}: has no image {name}: name the database of this model")
+                yield _features(f"{path}: image {name}", stored, of_model)
+    except _DAMAGES as error:
+        reason = str(error) or "its sizes make no sense"
+        raise MapError(
+            f"--database={path}: is damaged or no database: {reason}; copy it again, or import without "
+            "--database"
+        ) from error
 
-        Args:
-            name: Name of the image.
-            uv: Its keypoints (K, 2) in the model, in COLMAP's pixels.
 
-        Raises:
-            MapError: The image is not there, has other keypoints, or is damaged.
-        """
-        count = len(uv)
-        image = self._id_of.get(name)
-        if image is None:
-            raise MapError(f"{self.path}: has no image {name}: name the database of this model")
-        rows, columns, data = self._row("keypoints", "rows, cols, data", image) or (0, 2, b"")
-        with np.errstate(invalid="ignore"):  # of signalling NaN, which are refused
-            values = self._array(data, rows, columns, np.dtype("<f4"), name).astype(np.float64)
-        if columns < 2 or not (np.abs(values) < _LARGEST_KEYPOINT).all():
-            raise self._damaged(f"the keypoints of image {name} are no pixels")
-        if rows != count:
-            raise MapError(
-                f"{self.path}: image {name} has {rows} keypoints, and {count} in the model: name the "
-                "database of this model"
-            )
-        scale, kind = agreement(values[:, :2], uv)
-        if kind is None:
-            apart_px = float(np.median(np.linalg.norm(values[:, :2] - uv, axis=1)))
-            raise MapError(
-                f"{self.path}: the keypoints of image {name} are not those of the model (median distance "
-                f"{apart_px:.3g} px): it is of another extraction, name the database of this model"
-            )
-        return ImageFeatures(scale * _scales(values), *self._descriptors(image, count, name), kind)
+def _features(image: str, stored: tuple[Any, ...], uv: F64) -> ImageFeatures:
+    """Return the features of an image in a row of `_QUERY`.
 
-    def _descriptors(self, image: int, count: int, name: str) -> tuple[U8, DescriptorBlock | None]:
-        kind_column = "type" if self._has_types else str(_SIFT)
-        row = self._row("descriptors", f"{kind_column}, rows, cols, data", image)
-        if row is None or row[1] == 0:
-            return np.zeros((count, 0), dtype=np.uint8), None
-        kind, rows, columns, data = row
-        is_sift = kind == _SIFT and columns == _SIFT_BYTES
-        if not is_sift and kind != _UNDEFINED:
-            raise MapError(
-                f"{self.path}: descriptors of type {kind} with {columns} bytes: only SIFT of 128 bytes and "
-                "the binary ones of export_colmap can be imported; import without --database"
-            )
-        if rows != count:
-            raise self._damaged(f"image {name} has {rows} descriptors of {count} keypoints")
-        descriptor = self._array(data, rows, columns, np.dtype(np.uint8), name)
-        feature = FeatureType.SIFT if is_sift else FeatureType.BINARY
-        return descriptor, DescriptorBlock(count, columns, DescriptorDepth.UINT8, feature)
+    Raises:
+        ValueError: It is damaged.
+        MapError: It does not fit the keypoints of the model.
+    """
+    with np.errstate(invalid="ignore"):  # of signalling NaN, which are refused
+        values = _matrix(image, stored[:3], np.dtype("<f4")).astype(np.float64)
+    if values.shape[1] < 2 or not (np.abs(values) < _LARGEST_KEYPOINT).all():
+        raise ValueError(f"the keypoints of {image} are no pixels")
+    if len(values) != len(uv):
+        raise MapError(
+            f"{image} has {len(values)} keypoints, and {len(uv)} in the model: name the database of this "
+            "model"
+        )
+    ratio, kind = agreement(values[:, :2], uv)
+    if kind is None:
+        apart_px = float(np.median(np.linalg.norm(values[:, :2] - uv, axis=1)))
+        raise MapError(
+            f"{image}: the keypoints are not those of the model (median distance {apart_px:.3g} px): it is "
+            "of another extraction, name the database of this model"
+        )
+    scale = np.full(len(values), ratio)
+    if values.shape[1] >= 6:  # x, y and an affine shape
+        scale *= np.hypot(values[:, 2], values[:, 4])
+    elif values.shape[1] == 4:  # x, y, scale and orientation
+        scale *= values[:, 2]
+    number, *table = stored[3:]
+    descriptor = _matrix(image, table, np.dtype(np.uint8))
+    if not descriptor.size:
+        return ImageFeatures(scale, np.zeros((len(uv), 0), dtype=np.uint8), None, kind)
+    width = descriptor.shape[1]
+    is_sift = number == _SIFT and width == _SIFT_BYTES
+    if not is_sift and number != _UNDEFINED:
+        raise MapError(
+            f"{image}: has descriptors of type {number} with {width} bytes: only SIFT of 128 bytes and the "
+            "binary ones of export_colmap can be imported; import without --database"
+        )
+    if len(descriptor) != len(uv):
+        raise ValueError(f"{image} has {len(descriptor)} descriptors of {len(uv)} keypoints")
+    feature = FeatureType.SIFT if is_sift else FeatureType.BINARY
+    block = DescriptorBlock(len(uv), width, DescriptorDepth.UINT8, feature)
+    return ImageFeatures(scale, descriptor, block, kind)
 
-    def _row(self, table: str, columns: str, image: int) -> tuple[int, ...] | None:
-        query = f"SELECT {columns} FROM {table} WHERE image_id = ?"
-        try:
-            row: tuple[int, ...] | None = self._connection.execute(query, (image,)).fetchone()
-        except _DAMAGES as error:
-            raise self._damaged(str(error) or "its sizes make no sense") from error
-        if row is not None and not all(isinstance(value, int) for value in row[:-1]):
-            raise self._damaged(f"{table} of image {image} have no sizes")
-        return row
 
-    def _array(
-        self, data: object, rows: int, columns: int, kind: np.dtype, name: str
-    ) -> np.ndarray:
-        content = data if isinstance(data, bytes) else b""
-        if columns < 1 or len(content) != rows * columns * kind.itemsize:
-            raise self._damaged(f"the data of image {name} have the wrong size")
-        return np.frombuffer(content, dtype=kind).reshape(rows, columns)
-
-    def _damaged(self, reason: str) -> MapError:
-        return MapError(f"--database={self.path}: is damaged or no database: {reason}; {_REMEDY}")
+def _matrix(image: str, stored: Sequence[Any], kind: np.dtype[Any]) -> NDArray[Any]:
+    """Return a matrix of its rows, columns and data; none where the table has no row of the image."""
+    rows, columns, data = (0, 2, b"") if stored[0] in (None, 0) else stored
+    is_sized = isinstance(rows, int) and isinstance(columns, int) and columns > 0
+    if not is_sized or not isinstance(data, bytes) or len(data) != rows * columns * kind.itemsize:
+        raise ValueError(f"the data of {image} have the wrong size")
+    return np.frombuffer(data, dtype=kind).reshape(rows, columns)
 
 
 def agreement(database: F64, model: F64) -> tuple[float, str | None]:
@@ -181,13 +181,6 @@ def _is_same(a: F64, b: F64, tolerance_px: float = 1.0, share: float = _SHARE) -
     return len(apart) == 0 or float(np.mean(apart <= tolerance_px)) >= share
 
 
-def _scales(values: F64) -> F64:
-    """Return scales (K,) of keypoints: x, y; with scale, orientation; or with an affine shape."""
-    if values.shape[1] >= 6:
-        return np.asarray(np.hypot(values[:, 2], values[:, 4]))
-    return values[:, 2] if values.shape[1] == 4 else np.ones(len(values))
-
-
 _RAW_GREY, _RAW_COLOUR = 0, 4
 _MAX_IMAGE_BYTES = 1_000_000_000
 
@@ -205,15 +198,8 @@ def with_features(
         UserError: There is no such file.
         MapError: It does not fit the model, or is damaged.
     """
-    store = ColmapDatabase(database)
-    features = []
-    try:
-        start = vi_map.keypoint_start.tolist()
-        for row, name in enumerate(names):
-            progress.step(row, len(names), "descriptors")
-            features.append(store.features(name, uv[start[row] : start[row + 1]]))
-    finally:
-        store.close()
+    parts = np.split(uv, vi_map.keypoint_start[1:-1])[: len(names)]
+    features = list(features_of_images(database, names, parts, progress))
     width = max((part.descriptor.shape[1] for part in features), default=0)
     descriptor: U8 = np.zeros((len(vi_map.keypoints), width), dtype=np.uint8)
     for start, part in zip(vi_map.keypoint_start.tolist(), features, strict=False):

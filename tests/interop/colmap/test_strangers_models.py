@@ -155,7 +155,7 @@ def test_a_database_of_another_extraction_is_refused_by_image(copy: Path) -> Non
     plain, report = import_colmap(copy, ORDER, database=database)
     assert not any("database" in note for note in report.notes)
     edit_keypoints(database, lambda values: values[::-1])
-    with pytest.raises(MapError, match=r"keypoints of image .*\.png are not those of the model"):
+    with pytest.raises(MapError, match=r"image .*\.png: the keypoints are not those of the model"):
         import_colmap(copy, ORDER, database=database)
     edit_keypoints(database, lambda values: np.roll(values[::-1], 3, axis=0))
     with pytest.raises(MapError, match="another extraction"):
