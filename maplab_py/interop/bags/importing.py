@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +15,7 @@ from maplab_py.errors import MapError, UserError
 from maplab_py.interop.bags.options import BagImport, BagImportOptions
 from maplab_py.interop.bags.sensor_messages import CAMERA_INFO, CLOUD, COMPRESSED, IMAGE, cloud_of
 from maplab_py.interop.images import CONTAINER_BITS, sampled
+from maplab_py.interop.ply import PlyCloud
 from maplab_py.interop.recordings import bag_files, protocol
 from maplab_py.interop.recordings import images as recorded_images
 from maplab_py.interop.resources import matching, point_clouds
@@ -23,7 +24,7 @@ from maplab_py.interop.resources.images import RAW_COLOUR, RAW_GREY, add_image
 from maplab_py.progress import SILENT, Progress
 from maplab_py.sensors import Camera, Distortion, Projection, projection
 from maplab_py.storage.resources.new import NewResources
-from maplab_py.vimap import ResourceOwner, VIMap, from_hex, mission_labels, mission_time_spans_ns
+from maplab_py.vimap import VIMap, mission_labels
 
 if TYPE_CHECKING:
     from maplab_py.interop.recordings.bag_files import BagReader
@@ -252,16 +253,16 @@ def _import_images(
     difference_px = _calibration_difference(topic, options, camera)
     _, first = next(topic.chosen(np.array([0])))
     is_depth = _is_depth(first)
-    frames = matching.camera_frames(vi_map, mission, index)
-    kinds = (RAW_DEPTH_MAPS,) if is_depth else (RAW_GREY, RAW_COLOUR)
-    wanted = matching.frames_without(vi_map, frames, kinds)
-    matches = matching.matched_files(
-        vi_map.frames.timestamp_ns[wanted],
+    matched = matching.files_of_frames(
+        vi_map,
+        mission,
+        index,
+        (RAW_DEPTH_MAPS,) if is_depth else (RAW_GREY, RAW_COLOUR),
         topic.stamps_ns + camera.time_offset_ns + options.resource_time_offset_ns,
-        round(options.image_tolerance_ms * matching.MS_TO_NS),
+        options.image_tolerance_ms,
     )
-    owners, numbers = wanted[matches >= 0], matches[matches >= 0]
-    if not len(owners) and len(wanted) == len(frames):
+    owners, numbers = matched.frames, matched.files
+    if not len(owners) and not matched.had_some:
         raise UserError(
             f"{topic.name}: no message is within --image_tolerance_ms={options.image_tolerance_ms:g} "
             f"of a frame of camera {index}: check --resource_time_offset_ns and --map_mission"
@@ -285,8 +286,8 @@ def _import_images(
         messages=len(topic.stamps_ns),
         resource_types=new.type_names,
         attached=len(owners),
-        had_some=len(frames) - len(wanted),
-        frames_without_message=len(wanted) - len(owners),
+        had_some=matched.had_some,
+        frames_without_message=matched.without,
         camera=index,
         calibration_difference_px=difference_px,
     )
@@ -373,46 +374,28 @@ def _depth_m(message: Any, name: str, camera: Camera) -> F32:
 def _import_clouds(
     vi_map: VIMap, mission: int, topic: _Topic, options: BagImportOptions, progress: Progress
 ) -> tuple[VIMap, BagImport]:
-    sensor = point_clouds.chosen_sensor(vi_map, mission, options.sensor_id)
-    times_ns = topic.stamps_ns + options.resource_time_offset_ns
-    first_ns, last_ns = mission_time_spans_ns(vi_map)[mission].tolist()
-    inside = (times_ns >= first_ns) & (times_ns <= last_ns)
-    if not inside.any():
-        raise UserError(
-            f"{topic.name}: no stamp is within the mission, which goes from {first_ns} to {last_ns} ns:"
-            " check --resource_time_offset_ns and --map_mission"
-        )
-    chosen = np.flatnonzero(
-        inside & ~np.isin(times_ns, point_clouds.cloud_times_ns(vi_map, sensor))
-    )
-    new = NewResources(seed=vi_map.missions.id[mission].tobytes())
-    chosen, empty = point_clouds.add_clouds(
-        new,
-        chosen,
-        (
-            (number, partial(cloud_of, message, f"{topic.name} at {topic.stamps_ns[number]}"))
-            for number, message in topic.chosen(chosen)
-        ),
+    def read(numbers: I64) -> Iterator[Callable[[], PlyCloud]]:
+        for number, message in topic.chosen(numbers):
+            yield partial(cloud_of, message, f"{topic.name} at {topic.stamps_ns[number]}")
+
+    attached = point_clouds.attach_clouds(
+        vi_map,
+        mission,
+        options.sensor_id,
+        topic.stamps_ns + options.resource_time_offset_ns,
+        read,
+        topic.name,
+        "check --resource_time_offset_ns and --map_mission",
         progress,
     )
-    attached = vi_map
-    if len(chosen):
-        attached = new.attached(
-            vi_map,
-            np.arange(len(chosen)),
-            np.full(len(chosen), mission),
-            ResourceOwner.SENSOR,
-            sensor_id=from_hex(sensor),
-            timestamp_ns=times_ns[chosen],
-        )
-    return attached, BagImport(
+    return attached.vi_map, BagImport(
         mission=mission_labels(vi_map)[mission],
         topic=topic.topic,
         type=topic.type,
         messages=len(topic.stamps_ns),
-        resource_types=new.type_names,
-        attached=len(chosen),
-        had_some=int(np.count_nonzero(inside)) - len(chosen) - empty,
-        messages_outside_mission=int(np.count_nonzero(~inside)),
-        notes=point_clouds.empty_clouds_note(empty),
+        resource_types=attached.type_names,
+        attached=attached.count,
+        had_some=attached.had_some,
+        messages_outside_mission=attached.outside,
+        notes=attached.notes,
     )

@@ -61,33 +61,30 @@ def import_depth_maps(
     if not 0 <= camera < len(cameras):
         raise UserError(f"--camera={camera}: the mission has cameras 0 to {len(cameras) - 1}")
     times, files = matching.stamped_files(folder, (".png",), "--depth_folder")
-    frames = matching.camera_frames(vi_map, mission, camera)
-    wanted = matching.frames_without(vi_map, frames, (RAW_DEPTH_MAPS,))
-    matches = matching.matched_files(
-        vi_map.frames.timestamp_ns[wanted],
-        times + cameras[camera].time_offset_ns,
-        round(options.image_tolerance_ms * matching.MS_TO_NS),
+    offset_ns, kinds = cameras[camera].time_offset_ns, (RAW_DEPTH_MAPS,)
+    tolerance_ms = options.image_tolerance_ms
+    matched = matching.files_of_frames(
+        vi_map, mission, camera, kinds, times + offset_ns, tolerance_ms
     )
-    matched = np.flatnonzero(matches >= 0)
-    if not len(matched) and len(wanted) == len(frames):
+    if not len(matched.frames) and not matched.had_some:
         raise UserError(
-            f"--depth_folder={folder}: no file is within --image_tolerance_ms="
-            f"{options.image_tolerance_ms:g} of a frame of camera {camera}"
+            f"--depth_folder={folder}: no file is within --image_tolerance_ms={tolerance_ms:g} of a frame of "
+            f"camera {camera}"
         )
     new = NewResources(seed=vi_map.missions.id[mission].tobytes())
-    for done, match in enumerate(matches[matched].tolist()):
-        progress.step(done, len(matched), "depth maps")
-        depth_m = _read_depth(files[match], cameras[camera], options.depth_scale)
+    for done, row in enumerate(matched.files.tolist()):
+        progress.step(done, len(matched.files), "depth maps")
+        depth_m = _read_depth(files[row], cameras[camera], options.depth_scale)
         new.add(RAW_DEPTH_MAPS, encoded_depth(depth_m))
-    rows = np.arange(len(matched))
-    attached = new.attached(vi_map, rows, wanted[matched]) if len(rows) else vi_map
+    rows = np.arange(len(matched.frames))
+    attached = new.attached(vi_map, rows, matched.frames) if len(rows) else vi_map
     return attached, matching.ImportedResources(
         to_hex(vi_map.missions.id[mission]),
         (resource_type(RAW_DEPTH_MAPS).name,),
         len(files),
-        len(matched),
-        len(frames) - len(wanted),
-        len(wanted) - len(matched),
+        len(rows),
+        matched.had_some,
+        matched.without,
     )
 
 

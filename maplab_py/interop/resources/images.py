@@ -63,19 +63,21 @@ def import_images(
     owners: list[int] = []
     skipped = without = 0
     for camera in range(len(rig.cameras)):
-        frames = matching.camera_frames(vi_map, mission, camera, options.every_nth)
-        wanted = matching.frames_without(vi_map, frames, (RAW_GREY, RAW_COLOUR))
-        skipped += len(frames) - len(wanted)
         of_camera = [image for image in images if image.camera == camera]
-        times = np.array([image.time_ns for image in of_camera], dtype=np.int64)
-        tolerance_ns = round(options.image_tolerance_ms * matching.MS_TO_NS)
-        matches = matching.matched_files(vi_map.frames.timestamp_ns[wanted], times, tolerance_ns)
-        without += int(np.count_nonzero(matches < 0))
-        for done, (frame, match) in enumerate(zip(wanted.tolist(), matches.tolist(), strict=True)):
-            progress.step(done, len(wanted), f"images of camera {camera}")
-            if match >= 0:
-                rows.append(add_image(new, of_camera[match], link=options.link))
-                owners.append(frame)
+        matched = matching.files_of_frames(
+            vi_map,
+            mission,
+            camera,
+            (RAW_GREY, RAW_COLOUR),
+            np.array([image.time_ns for image in of_camera], dtype=np.int64),
+            options.image_tolerance_ms,
+            options.every_nth,
+        )
+        skipped, without = skipped + matched.had_some, without + matched.without
+        for done, row in enumerate(matched.files.tolist()):
+            progress.step(done, len(matched.files), f"images of camera {camera}")
+            rows.append(add_image(new, of_camera[row], link=options.link))
+        owners += matched.frames.tolist()
     if not rows and not skipped:
         raise UserError(
             f"--dataset_folder={folder}: no image is within --image_tolerance_ms="

@@ -37,11 +37,41 @@ def camera_frames(vi_map: VIMap, mission: int, camera: int, every_nth: int = 1) 
     return rows[np.argsort(vi_map.frames.timestamp_ns[rows], kind="stable")]
 
 
-def frames_without(vi_map: VIMap, frames: I64, kinds: tuple[int, ...]) -> I64:
-    """Return the frames (rows) that own no resource of some types."""
-    table = vi_map.resources
+@dataclasses.dataclass(frozen=True, eq=False)
+class FrameFiles:
+    """Frames of a camera without resource, and the files of their times."""
+
+    frames: I64  # (N,) rows
+    files: I64  # (N,) rows
+    had_some: int  # frames with a resource
+    without: int  # frames without resource and file
+
+
+def files_of_frames(
+    vi_map: VIMap,
+    mission: int,
+    camera: int,
+    kinds: tuple[int, ...],
+    file_times_ns: I64,
+    tolerance_ms: float,
+    every_nth: int = 1,
+) -> FrameFiles:
+    """Return the frames that lack resources of some types and have a file; see `matched_files`.
+
+    Args:
+        mission: Row.
+        camera: Index in its rig.
+        file_times_ns: Times of files (M,), sorted.
+        every_nth: Take the frames of every n-th vertex only.
+    """
+    frames, table = camera_frames(vi_map, mission, camera, every_nth), vi_map.resources
     owned = (table.owner_kind == ResourceOwner.FRAME) & np.isin(table.type, kinds)
-    return frames[~np.isin(frames, table.owner[owned])]
+    wanted = frames[~np.isin(frames, table.owner[owned])]
+    times_ns = vi_map.frames.timestamp_ns[wanted]
+    files = matched_files(times_ns, file_times_ns, round(tolerance_ms * MS_TO_NS))
+    is_matched = files >= 0
+    without = int(np.count_nonzero(~is_matched))
+    return FrameFiles(wanted[is_matched], files[is_matched], len(frames) - len(wanted), without)
 
 
 def matched_files(frame_times_ns: I64, file_times_ns: I64, tolerance_ns: int) -> I64:

@@ -1,5 +1,6 @@
 """Point clouds of other programs as resources of a sensor at a time."""
 
+import dataclasses
 from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
@@ -141,84 +142,103 @@ def import_point_clouds(
         UserError: There are no files, no such sensor, or no file is of a time of the mission.
         MapError: A file is damaged or has no points.
     """
-    sensor = chosen_sensor(vi_map, mission, sensor_id)
     times, files = stamped_files(folder, (".ply", ".pcd"), "--point_cloud_folder")
-    first_ns, last_ns = queries.mission_time_spans_ns(vi_map)[mission].tolist()
-    inside = (times >= first_ns) & (times <= last_ns)
-    if not inside.any():
-        raise UserError(
-            f"--point_cloud_folder={folder}: no stamp is within the mission, which goes from "
-            f"{first_ns} to {last_ns} ns"
-        )
-    chosen = np.flatnonzero(inside & ~np.isin(times, cloud_times_ns(vi_map, sensor)))
-    new = NewResources(seed=vi_map.missions.id[mission].tobytes())
-    chosen, empty = add_clouds(
-        new, chosen, ((row, partial(read_cloud, files[row])) for row in chosen.tolist()), progress
+    attached = attach_clouds(
+        vi_map,
+        mission,
+        sensor_id,
+        times,
+        lambda rows: (partial(read_cloud, files[row]) for row in rows.tolist()),
+        f"--point_cloud_folder={folder}",
+        "check --map_mission",
+        progress,
     )
-    if len(chosen):
-        vi_map = new.attached(
-            vi_map,
-            np.arange(len(chosen)),
-            np.full(len(chosen), mission),
-            ResourceOwner.SENSOR,
-            sensor_id=from_hex(sensor),
-            timestamp_ns=times[chosen],
-        )
-    outside = int(np.count_nonzero(~inside))
-    notes: tuple[str, ...] = ()
-    if outside:
-        notes = (f"{outside} files are of times outside the mission",)
-    notes += empty_clouds_note(empty)
-    mission_id = to_hex(vi_map.missions.id[mission])
-    return vi_map, ImportedResources(
-        mission_id,
-        new.type_names,
+    notes = attached.notes
+    if attached.outside:
+        notes = (f"{attached.outside} files are of times outside the mission", *notes)
+    return attached.vi_map, ImportedResources(
+        to_hex(vi_map.missions.id[mission]),
+        attached.type_names,
         len(files),
-        len(chosen),
-        len(files) - outside - len(chosen) - empty,
+        attached.count,
+        attached.had_some,
         notes=notes,
     )
 
 
-def add_clouds(
-    new: NewResources,
-    chosen: I64,
-    clouds: Iterable[tuple[int, Callable[[], PlyCloud]]],
+@dataclasses.dataclass(frozen=True, eq=False)
+class AttachedClouds:
+    """A map with new clouds, and what was left out."""
+
+    vi_map: VIMap
+    type_names: tuple[str, ...]
+    count: int
+    had_some: int  # clouds of times of which the sensor has one
+    outside: int  # clouds of times outside the mission
+    notes: tuple[str, ...]
+
+
+def attach_clouds(
+    vi_map: VIMap,
+    mission: int,
+    sensor_id: str,
+    times_ns: I64,
+    read: Callable[[I64], Iterable[Callable[[], PlyCloud]]],
+    source: str,
+    remedy: str,
     progress: Progress,
-) -> tuple[I64, int]:
-    """Add clouds to new resources; return those of the chosen rows that have points, and the number without.
+) -> AttachedClouds:
+    """Attach clouds to a sensor of a mission (row); those without finite points are left out.
+
+    Args:
+        sensor_id: Sensor, or an unambiguous prefix; empty = the mission's lidar.
+        times_ns: Times (N,) of the clouds.
+        read: Yields what reads each cloud of some rows.
+        source: Name of where they come from, for messages.
+        remedy: Helps where all are of other times.
 
     Raises:
+        UserError: There is no such sensor, or no cloud is of a time of the mission.
         MapError: A cloud is damaged, or all are empty.
     """
+    sensor, table = chosen_sensor(vi_map, mission, sensor_id), vi_map.resources
+    first_ns, last_ns = queries.mission_time_spans_ns(vi_map)[mission].tolist()
+    inside = (times_ns >= first_ns) & (times_ns <= last_ns)
+    if not inside.any():
+        raise UserError(
+            f"{source}: no stamp is within the mission, which goes from {first_ns} to {last_ns} ns: {remedy}"
+        )
+    known = (table.owner_kind == ResourceOwner.SENSOR) & np.isin(table.type, (XYZ, XYZRGB, XYZI))
+    known &= np.all(table.sensor_id == from_hex(sensor), axis=1)
+    chosen = np.flatnonzero(inside & ~np.isin(times_ns, table.timestamp_ns[known]))
+    new = NewResources(seed=vi_map.missions.id[mission].tobytes())
     kept: list[int] = []
     problem: EmptyCloud | None = None
-    for done, (row, read) in enumerate(clouds):
-        progress.step(done, len(chosen), "point clouds")
+    for row, read_one in zip(chosen.tolist(), read(chosen), strict=True):
+        progress.step(len(kept), len(chosen), "point clouds")
         try:
-            cloud = read()
+            cloud = read_one()
         except EmptyCloud as error:
             problem = problem or error
             continue
-        new.add(cloud_type(cloud), b"".join(encode_ply(cloud)))
+        kind = XYZ if cloud.intensity is None else XYZI
+        new.add(kind if cloud.colours is None else XYZRGB, b"".join(encode_ply(cloud)))
         kept.append(row)
     if problem is not None and not kept:
         raise problem
-    return np.array(kept, dtype=np.int64), len(chosen) - len(kept)
-
-
-def empty_clouds_note(count: int) -> tuple[str, ...]:
-    """Return a note on clouds that were left out."""
-    return (f"{counted(count, 'cloud')} without finite points left out",) if count else ()
-
-
-def cloud_times_ns(vi_map: VIMap, sensor_id: str) -> I64:
-    """Return the times (N,) of the clouds that a sensor has."""
-    table = vi_map.resources
-    known = (table.owner_kind == ResourceOwner.SENSOR) & np.isin(table.type, (XYZ, XYZRGB, XYZI))
-    known &= np.all(table.sensor_id == from_hex(sensor_id), axis=1)
-    times_ns: I64 = table.timestamp_ns[known]
-    return times_ns
+    if kept:
+        vi_map = new.attached(
+            vi_map,
+            np.arange(len(kept)),
+            np.full(len(kept), mission),
+            ResourceOwner.SENSOR,
+            sensor_id=from_hex(sensor),
+            timestamp_ns=times_ns[kept],
+        )
+    empty, outside = len(chosen) - len(kept), int(np.count_nonzero(~inside))
+    had_some = len(times_ns) - outside - len(chosen)
+    notes = (f"{counted(empty, 'cloud')} without finite points left out",) if empty else ()
+    return AttachedClouds(vi_map, new.type_names, len(kept), had_some, outside, notes)
 
 
 def read_cloud(path: Path) -> PlyCloud:
@@ -236,13 +256,6 @@ def read_cloud(path: Path) -> PlyCloud:
         problem = "is not finite" if len(cloud.p) else "is empty"
         raise EmptyCloud(f"{path}: the cloud {problem}: remove the file, or export it again")
     return cloud if valid.all() else cloud.where(valid)
-
-
-def cloud_type(cloud: PlyCloud) -> int:
-    """Return the number of the resource type that holds all of a cloud's columns."""
-    if cloud.colours is not None:
-        return XYZRGB
-    return XYZI if cloud.intensity is not None else XYZ
 
 
 def chosen_sensor(vi_map: VIMap, mission: int, prefix: str) -> str:
