@@ -73,6 +73,7 @@ from numba.core.caching import FunctionCache  # noqa: E402
 from numba.core.dispatcher import Dispatcher  # noqa: E402
 from numba.core.extending import _Intrinsic  # noqa: E402
 from numba.core.registry import CPUDispatcher  # noqa: E402
+from numba.core.runtime.nrt import rtsys  # noqa: E402
 from numba.core.sigutils import normalize_signature  # noqa: E402
 from numba.core.targetconfig import ConfigStack  # noqa: E402
 
@@ -160,7 +161,8 @@ def _leave_out_wrappers(flags: Any) -> Any:
     return flags
 
 
-numba_changes.change_compiler()
+numba_changes.load_little()
+numba_changes.make_code_when_needed()
 
 
 class _KernelCache(FunctionCache):  # type: ignore[misc]
@@ -174,6 +176,15 @@ class _KernelCache(FunctionCache):  # type: ignore[misc]
 
     def flush(self) -> None:
         """Keep the files: others have the same content."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return a kernel from disk, else nothing; only then numba's tables of functions are filled."""
+        rtsys.initialize(target_context)
+        loaded = self._load_overload(sig, target_context)
+        if loaded is None:
+            numba_changes.change_compiler()
+            target_context.refresh()
+        return loaded
 
     def _load_overload(self, sig: Any, target_context: Any) -> Any:
         if not self._enabled:

@@ -11,24 +11,22 @@ from typing import Any
 
 import numba
 import numba.extending
-from numba.core import cgutils, event, ir
+from numba.core import cgutils, entrypoints, environment, event, ir
 from numba.core.codegen import CPUCodeLibrary, JITCodeLibrary, JITCPUCodegen
 from numba.core.environment import lookup_environment
 from numba.core.lowering import Lower
 from numba.core.postproc import PostProcessor, VariableLifetime
 from numba.core.targetconfig import ConfigStack
 from numba.core.transforms import canonicalize_cfg
-from numba.np import arrayobj
-from numba.np.arrayobj import fix_integer_index, load_item, store_item
 
 types: Any = numba.types
 
 
+@cache
 def change_compiler() -> None:
-    """Make all changes of this module."""
+    """Make all changes of this module but those that loading kernels needs."""
     _leave_out_what_nobody_reads()
     _remember_types()
-    _make_code_when_needed()
     _borrow_arguments()
     _index_directly()
 
@@ -39,6 +37,8 @@ def _leave_out_what_nobody_reads() -> None:
     They are a third of the time: functions that print numbers are compiled for each assignment to a part
     of an array.
     """
+    from numba.np import arrayobj
+
     run = PostProcessor.run
 
     def post_process(self: Any, emit_dels: bool = False, extend_lifetimes: bool = False) -> None:
@@ -108,7 +108,21 @@ def _remember_types() -> None:
     numba.core.dispatcher._FunctionCompiler._customize_flags = customize_flags
 
 
-def _make_code_when_needed() -> None:
+def load_little() -> None:
+    """Let numba load kernels without its extensions and the modules of the functions that they contain.
+
+    Compiled code does not read the names in those modules; scipy, which some import, takes 0.15 s.
+    """
+    make = environment._rebuild_env
+
+    def make_environment(module: str, constants: Any, name: str) -> Any:
+        return make("numba" if module.startswith("numba.") else module, constants, name)
+
+    environment._rebuild_env = make_environment
+    entrypoints._already_initialized = True
+
+
+def make_code_when_needed() -> None:
     """Let LLVM optimise functions and make machine code where Python calls them, with all that they call.
 
     Functions that only other functions call are linked into those as they are; numba optimises them in every
@@ -256,6 +270,8 @@ def _index_directly() -> None:
 
     Through a description of the array on the stack they are twice as many, half of those of many kernels.
     """
+    from numba.np.arrayobj import load_item, store_item
+
     lower_getitem, lower_setitem = Lower.lower_getitem, Lower.lower_setitem
 
     def getitem(self: Any, kind: Any, expr: Any, value: Any, index: Any, signature: Any) -> Any:
@@ -292,6 +308,8 @@ def _is_element(signature: Any) -> bool:
 
 def _place(lower: Any, array: Any, index: Any, signature: Any) -> Any:
     """Return the address of an element; negative indices count from the end."""
+    from numba.np.arrayobj import fix_integer_index
+
     context, builder, (kind, index_kind, *_) = lower.context, lower.builder, signature.args
     value = context.cast(builder, lower.loadvar(array.name), lower.typeof(array.name), kind)
     field = context.data_model_manager[kind].get_field_position

@@ -136,13 +136,15 @@ def _compile_dense() -> None:
 
 def _scan_message() -> None:
     """Compile the walk over the fields of a message and the reading of ids."""
-    from maplab_py.storage.protobuf.id_fields_kernel import read_ids
+    from maplab_py.storage.protobuf.id_fields_kernel import landmark_columns, read_ids
 
     message = pb.VIMapMetadata()
     message.files.add(file_type=0, path="missions")
     ids_of_parts(bytes(LARGE_MESSAGE), 10, (1, 2))
     begin = np.zeros(1, dtype=np.int64)
-    read_ids(np.frombuffer(bytes(1), dtype=np.uint8), begin[:0], begin[:0], 1, 0)
+    data = np.frombuffer(bytes(1), dtype=np.uint8)
+    read_ids(data, begin[:0], begin[:0], 1, 0)
+    landmark_columns(data, begin[:0], begin[:0])
     estimate(message.SerializeToString(), pb.VIMapMetadata.DESCRIPTOR)  # type: ignore[arg-type]
 
 

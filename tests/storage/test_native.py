@@ -16,6 +16,7 @@ from maplab_py.progress import SilentProgress
 from maplab_py.sensors import Distortion, Projection
 from maplab_py.storage import maplab_map_pb2 as pb
 from maplab_py.storage.native import disk_copy, load_map, save_map
+from maplab_py.storage.protobuf import ids
 from maplab_py.vimap import VIMap, consistency
 from tests.support import data, scene
 
@@ -107,6 +108,26 @@ def test_unknown_fields_survive(tmp_path: Path) -> None:
     assert vi_map.missions.unknown[0] == extra
     assert again.missions.unknown[0] == extra
     assert sorted(again.vertices.unknown)[-1] == extra
+
+
+@pytest.mark.parametrize("extra", [b"", b"\xa2\x1f\x05hello"])
+def test_bytes_and_objects_of_landmarks_say_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, extra: bytes
+) -> None:
+    def change(message: pb.VIMap) -> None:
+        store = next(v.landmark_store for v in message.vertices if v.landmark_store.landmarks)
+        store.landmarks[0].covariance.extend(range(9))
+        store.landmarks[0].ClearField("p_I")
+        store.landmarks[0].feature_type = 3
+        store.landmarks[1].MergeFromString(extra)
+
+    folder = damaged_copy(tmp_path, lambda folder: rewritten(folder, "vertices0", change))
+    monkeypatch.setattr(ids, "_WORTH_A_KERNEL", 0)
+    read, _ = load_map(folder)
+    monkeypatch.setattr(ids, "_WORTH_A_KERNEL", 1 << 62)
+    assert differences(read, load_map(folder)[0]) == []
+    assert (b"".join(read.landmarks.unknown), read.landmarks.feature_type.max()) == (extra, 3)
+    assert np.count_nonzero(np.isfinite(read.landmarks.covariance)) == 9
 
 
 def _disagreement(folder: Path) -> None:

@@ -10,7 +10,7 @@ from maplab_py.array_types import I32, I64, U64, NDArray
 from maplab_py.errors import MapError
 from maplab_py.report import counted
 from maplab_py.storage.protobuf import descriptor_layout, map_files, message_numbers
-from maplab_py.storage.protobuf.ids import ids_of, ids_of_field, unknown_bytes
+from maplab_py.storage.protobuf.ids import ids_of, ids_of_field, is_worth_a_kernel, unknown_bytes
 from maplab_py.storage.protobuf.message_numbers import Name
 from maplab_py.vimap import IdIndex, is_valid, tables, to_hex
 from maplab_py.vimap.table import object_column, starts_of_counts
@@ -98,6 +98,8 @@ def read_landmarks(
     Raises:
         MapError: The three lists of a landmark differ in length, or a number is not one.
     """
+    if (read := _landmarks_in_bytes(vertices)) is not None:
+        return read
     owned = [
         (row, lm) for row, vertex in enumerate(vertices) for lm in vertex.landmark_store.landmarks
     ]
@@ -138,6 +140,43 @@ def read_landmarks(
         "frame_index": _joined([lm.frame_indices for lm in landmarks]),
         "keypoint_index": _joined([lm.keypoint_indices for lm in landmarks]),
         "owner": np.repeat(np.arange(len(counts)), counts),
+    }
+
+
+def _landmarks_in_bytes(
+    vertices: list[Any],
+) -> tuple[tables.Landmarks, dict[str, U64 | I64]] | None:
+    """Return what `read_landmarks` does, read from bytes; None for few landmarks or irregular ones."""
+    stores = [vertex.landmark_store for vertex in vertices]
+    stored = np.array([len(store.landmarks) for store in stores], dtype=np.int64)
+    if not is_worth_a_kernel(int(stored.sum())):
+        return None
+    from maplab_py.storage.protobuf.id_fields_kernel import landmark_columns, parts_of_field
+
+    data = np.frombuffer(b"".join(s.SerializePartialToString() for s in stores), dtype=np.uint8)
+    begin, end, is_regular = parts_of_field(data, 1)
+    if not is_regular or len(begin) != stored.sum():
+        return None
+    *columns, lengths, observers, indices, is_regular = landmark_columns(data, begin, end)
+    ids, numbers, kinds = columns
+    p_I, covariance = (part.copy() for part in np.split(numbers.view(np.float64), [3], axis=1))
+    is_known = (kinds[:, 0] >= 0) & (kinds[:, 0] < len(tables.LandmarkQuality))
+    if not (is_regular and is_known.all() and np.isfinite(p_I).all()):
+        return None
+    table = tables.Landmarks.filled(
+        len(ids),
+        id=ids.byteswap(),
+        vertex=np.repeat(np.arange(len(vertices)), stored),
+        p_I=p_I,
+        covariance=covariance.reshape(-1, 3, 3),
+        quality=kinds[:, 0],
+        feature_type=kinds[:, 1],
+    )
+    return table, {
+        "observers": observers.byteswap(),
+        "frame_index": indices[1],
+        "keypoint_index": indices[0],
+        "owner": np.repeat(np.arange(len(ids)), lengths[:, 0]),
     }
 
 

@@ -19,7 +19,9 @@ from maplab_py.errors import MapError
 _WORDS = attrgetter("words")
 _WORTH_A_KERNEL = 50_000
 """Number of ids after which loading the compiled kernel takes less time than their objects."""
-LARGE_MESSAGE = 1 << 20
+_MANY = 4
+"""Number of ids per message from which its bytes are read in less time than their objects."""
+LARGE_MESSAGE = 1 << 18
 """Bytes of a message from which its ids are read without its parts becoming objects."""
 _PORTION = 4096
 """Number of ids per batch: their Python views take ten times the memory of the ids."""
@@ -29,6 +31,12 @@ class _Read:
     """Number of ids that this process has read; only the way of reading depends on it."""
 
     ids = 0
+
+
+def is_worth_a_kernel(ids: int) -> bool:
+    """Tell whether this process has read enough ids, with some more, to load the compiled kernel."""
+    _Read.ids += ids
+    return _Read.ids >= _WORTH_A_KERNEL
 
 
 def ids_of(messages: Iterable[Any], where: str, name: Callable[[int], str] | None = None) -> U64:
@@ -85,8 +93,7 @@ def ids_of_field(
     """
     counts = np.fromiter((len(getattr(m, field)) for m in messages), np.int64, len(messages))
     total = int(counts.sum())
-    _Read.ids += total
-    if total and _Read.ids >= _WORTH_A_KERNEL:
+    if total > _MANY * len(counts) and is_worth_a_kernel(total):
         ids, is_regular = _ids_in_bytes(messages, field, total)
         if is_regular:
             return ids, counts
