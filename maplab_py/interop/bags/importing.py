@@ -253,7 +253,7 @@ def _import_images(
     difference_px = _calibration_difference(topic, options, camera)
     _, first = next(topic.chosen(np.array([0])))
     is_depth = _is_depth(first)
-    matched = matching.files_of_frames(
+    owners, numbers, had_some, without = matching.files_of_frames(
         vi_map,
         mission,
         index,
@@ -261,8 +261,7 @@ def _import_images(
         topic.stamps_ns + camera.time_offset_ns + options.resource_time_offset_ns,
         options.image_tolerance_ms,
     )
-    owners, numbers = matched.frames, matched.files
-    if not len(owners) and not matched.had_some:
+    if not len(owners) and not had_some:
         raise UserError(
             f"{topic.name}: no message is within --image_tolerance_ms={options.image_tolerance_ms:g} "
             f"of a frame of camera {index}: check --resource_time_offset_ns and --map_mission"
@@ -286,8 +285,8 @@ def _import_images(
         messages=len(topic.stamps_ns),
         resource_types=new.type_names,
         attached=len(owners),
-        had_some=matched.had_some,
-        frames_without_message=matched.without,
+        had_some=had_some,
+        frames_without_message=without,
         camera=index,
         calibration_difference_px=difference_px,
     )
@@ -378,7 +377,7 @@ def _import_clouds(
         for number, message in topic.chosen(numbers):
             yield partial(cloud_of, message, f"{topic.name} at {topic.stamps_ns[number]}")
 
-    attached = point_clouds.attach_clouds(
+    vi_map, report, outside = point_clouds.attach_clouds(
         vi_map,
         mission,
         options.sensor_id,
@@ -388,14 +387,14 @@ def _import_clouds(
         "check --resource_time_offset_ns and --map_mission",
         progress,
     )
-    return attached.vi_map, BagImport(
+    return vi_map, BagImport(
         mission=mission_labels(vi_map)[mission],
         topic=topic.topic,
         type=topic.type,
-        messages=len(topic.stamps_ns),
-        resource_types=attached.type_names,
-        attached=attached.count,
-        had_some=attached.had_some,
-        messages_outside_mission=attached.outside,
-        notes=attached.notes,
+        messages=report.files_in_folder,
+        resource_types=report.resource_types,
+        attached=report.attached,
+        had_some=report.frames_that_had_some,
+        messages_outside_mission=outside,
+        notes=report.notes,
     )

@@ -63,28 +63,28 @@ def import_depth_maps(
     times, files = matching.stamped_files(folder, (".png",), "--depth_folder")
     offset_ns, kinds = cameras[camera].time_offset_ns, (RAW_DEPTH_MAPS,)
     tolerance_ms = options.image_tolerance_ms
-    matched = matching.files_of_frames(
+    frames, chosen, had_some, without = matching.files_of_frames(
         vi_map, mission, camera, kinds, times + offset_ns, tolerance_ms
     )
-    if not len(matched.frames) and not matched.had_some:
+    if not len(frames) and not had_some:
         raise UserError(
             f"--depth_folder={folder}: no file is within --image_tolerance_ms={tolerance_ms:g} of a frame of "
             f"camera {camera}"
         )
     new = NewResources(seed=vi_map.missions.id[mission].tobytes())
-    for done, row in enumerate(matched.files.tolist()):
-        progress.step(done, len(matched.files), "depth maps")
+    for done, row in enumerate(chosen.tolist()):
+        progress.step(done, len(chosen), "depth maps")
         depth_m = _read_depth(files[row], cameras[camera], options.depth_scale)
         new.add(RAW_DEPTH_MAPS, encoded_depth(depth_m))
-    rows = np.arange(len(matched.frames))
-    attached = new.attached(vi_map, rows, matched.frames) if len(rows) else vi_map
+    rows = np.arange(len(frames))
+    attached = new.attached(vi_map, rows, frames) if len(rows) else vi_map
     return attached, matching.ImportedResources(
         to_hex(vi_map.missions.id[mission]),
         (resource_type(RAW_DEPTH_MAPS).name,),
         len(files),
         len(rows),
-        matched.had_some,
-        matched.without,
+        had_some,
+        without,
     )
 
 

@@ -64,7 +64,7 @@ def import_images(
     skipped = without = 0
     for camera in range(len(rig.cameras)):
         of_camera = [image for image in images if image.camera == camera]
-        matched = matching.files_of_frames(
+        frames, files, had_some, unmatched = matching.files_of_frames(
             vi_map,
             mission,
             camera,
@@ -73,11 +73,11 @@ def import_images(
             options.image_tolerance_ms,
             options.every_nth,
         )
-        skipped, without = skipped + matched.had_some, without + matched.without
-        for done, row in enumerate(matched.files.tolist()):
-            progress.step(done, len(matched.files), f"images of camera {camera}")
+        skipped, without = skipped + had_some, without + unmatched
+        for done, row in enumerate(files.tolist()):
+            progress.step(done, len(files), f"images of camera {camera}")
             rows.append(add_image(new, of_camera[row], link=options.link))
-        owners += matched.frames.tolist()
+        owners += frames.tolist()
     if not rows and not skipped:
         raise UserError(
             f"--dataset_folder={folder}: no image is within --image_tolerance_ms="

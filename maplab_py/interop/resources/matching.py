@@ -37,16 +37,6 @@ def camera_frames(vi_map: VIMap, mission: int, camera: int, every_nth: int = 1) 
     return rows[np.argsort(vi_map.frames.timestamp_ns[rows], kind="stable")]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class FrameFiles:
-    """Frames of a camera without resource, and the files of their times."""
-
-    frames: I64  # (N,) rows
-    files: I64  # (N,) rows
-    had_some: int  # frames with a resource
-    without: int  # frames without resource and file
-
-
 def files_of_frames(
     vi_map: VIMap,
     mission: int,
@@ -55,8 +45,10 @@ def files_of_frames(
     file_times_ns: I64,
     tolerance_ms: float,
     every_nth: int = 1,
-) -> FrameFiles:
-    """Return the frames that lack resources of some types and have a file; see `matched_files`.
+) -> tuple[I64, I64, int, int]:
+    """Return frames (N,) that lack resources of some types, and their files (N,); see `matched_files`.
+
+    Behind these are the numbers of frames that have a resource, and of those without resource and file.
 
     Args:
         mission: Row.
@@ -71,7 +63,7 @@ def files_of_frames(
     files = matched_files(times_ns, file_times_ns, round(tolerance_ms * MS_TO_NS))
     is_matched = files >= 0
     without = int(np.count_nonzero(~is_matched))
-    return FrameFiles(wanted[is_matched], files[is_matched], len(frames) - len(wanted), without)
+    return wanted[is_matched], files[is_matched], len(frames) - len(wanted), without
 
 
 def matched_files(frame_times_ns: I64, file_times_ns: I64, tolerance_ns: int) -> I64:

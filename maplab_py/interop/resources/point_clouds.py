@@ -143,7 +143,7 @@ def import_point_clouds(
         MapError: A file is damaged or has no points.
     """
     times, files = stamped_files(folder, (".ply", ".pcd"), "--point_cloud_folder")
-    attached = attach_clouds(
+    vi_map, report, outside = attach_clouds(
         vi_map,
         mission,
         sensor_id,
@@ -153,29 +153,10 @@ def import_point_clouds(
         "check --map_mission",
         progress,
     )
-    notes = attached.notes
-    if attached.outside:
-        notes = (f"{attached.outside} files are of times outside the mission", *notes)
-    return attached.vi_map, ImportedResources(
-        to_hex(vi_map.missions.id[mission]),
-        attached.type_names,
-        len(files),
-        attached.count,
-        attached.had_some,
-        notes=notes,
-    )
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class AttachedClouds:
-    """A map with new clouds, and what was left out."""
-
-    vi_map: VIMap
-    type_names: tuple[str, ...]
-    count: int
-    had_some: int  # clouds of times of which the sensor has one
-    outside: int  # clouds of times outside the mission
-    notes: tuple[str, ...]
+    if not outside:
+        return vi_map, report
+    note = f"{outside} files are of times outside the mission"
+    return vi_map, dataclasses.replace(report, notes=(note, *report.notes))
 
 
 def attach_clouds(
@@ -187,8 +168,10 @@ def attach_clouds(
     source: str,
     remedy: str,
     progress: Progress,
-) -> AttachedClouds:
-    """Attach clouds to a sensor of a mission (row); those without finite points are left out.
+) -> tuple[VIMap, ImportedResources, int]:
+    """Attach clouds to a sensor of a mission (row), and count those of times outside the mission.
+
+    Clouds without finite points, and of times of which the sensor has one, are left out.
 
     Args:
         sensor_id: Sensor, or an unambiguous prefix; empty = the mission's lidar.
@@ -238,7 +221,11 @@ def attach_clouds(
     empty, outside = len(chosen) - len(kept), int(np.count_nonzero(~inside))
     had_some = len(times_ns) - outside - len(chosen)
     notes = (f"{counted(empty, 'cloud')} without finite points left out",) if empty else ()
-    return AttachedClouds(vi_map, new.type_names, len(kept), had_some, outside, notes)
+    mission_id = to_hex(vi_map.missions.id[mission])
+    report = ImportedResources(
+        mission_id, new.type_names, len(times_ns), len(kept), had_some, notes=notes
+    )
+    return vi_map, report, outside
 
 
 def read_cloud(path: Path) -> PlyCloud:
