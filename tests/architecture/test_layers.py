@@ -105,8 +105,7 @@ MAY_WRITE = (
     "plugins/maplab_plugins/console/session.py",
     "maplab_py/console/commands/plugin_template.py",  # text of a test
     "maplab_py/console/terminal/output.py",  # a transcript is appended to
-    "maplab_py/interop/colmap/child.py",  # databases and models in a temporary folder
-    "maplab_py/interop/colmap/child_process.py",  # likewise
+    "maplab_py/interop/colmap/pycolmap_files.py",  # models in a temporary folder
     "maplab_py/pipeline/execution.py",  # output and log of a running task
     "maplab_py/server/status.py",  # likewise
     "maplab_py/server/worker.py",  # likewise

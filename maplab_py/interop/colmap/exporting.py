@@ -6,31 +6,27 @@ import dataclasses
 import re
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64, NDArray
+from maplab_py.array_types import F64, I64
 from maplab_py.distinct import distinct
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3
-from maplab_py.interop.colmap import child, child_process, undistortion, writing
 from maplab_py.interop.colmap import model as colmap
+from maplab_py.interop.colmap import pycolmap_files, undistortion, writing
 from maplab_py.interop.colmap.options import ColmapExportOptions, ColmapExportReport
+from maplab_py.interop.colmap.pycolmap_files import DATABASE
 from maplab_py.output_files import check_writable, copy_file, write_bytes
 from maplab_py.sensors import Camera, projection
 from maplab_py.vimap import LandmarkQuality, MissionSensor, VIMap, edits, from_hex, is_valid
 from maplab_py.vimap.descriptors import (
-    DescriptorDepth,
-    FeatureType,
     type_name,
     type_of_name,
     types_of,
 )
 from maplab_py.vimap.queries import is_metric, mission_labels, mission_sensor_id
-from maplab_py.vimap.table import ragged_rows, starts_of_counts
-
-DATABASE = "database.db"
+from maplab_py.vimap.table import ragged_rows
 
 
 def export_colmap(
@@ -58,21 +54,18 @@ def export_colmap(
         vi_map, lost = undistortion.undistorted(vi_map, rows)
     exported = model_of_map(vi_map, rows, quality=options.quality)
     model = exported.model
-    with tempfile.TemporaryDirectory(prefix="maplab-colmap-") as name:
-        work = Path(name)
-        if options.colmap_format == "text" or options.colmap_database:
-            child_process.write_job_model(model, work)
+    with tempfile.TemporaryDirectory(prefix="maplab-colmap-") as work:
         if options.colmap_format == "text":
-            child_process.run_job("write_text", work, folder)
-            for kind in colmap.FILES:
-                path = folder / f"{kind}.txt"
-                copy_file(work / child.TEXT / path.name, path, overwrite=overwrite)
+            pycolmap_files.write_text(model, Path(work), folder, overwrite=overwrite)
         else:
             for file, content in writing.binary_files(model).items():
                 write_bytes(folder / file, content, overwrite=overwrite)
         write_bytes(folder / colmap.FILE_NAME, [exported.side_file.content()], overwrite=overwrite)
         if options.colmap_database:
-            _write_database(vi_map, exported, options, work, folder, overwrite=overwrite)
+            features = pycolmap_files.Features(vi_map, exported.frames, exported.keypoints)
+            has_priors = options.colmap_pose_priors
+            pycolmap_files.write_database(model, features, Path(work), has_priors=has_priors)
+            copy_file(Path(work) / DATABASE, folder / DATABASE, overwrite=overwrite)
     return ColmapExportReport(
         folder=folder,
         cameras=len(model.cameras),
@@ -123,94 +116,6 @@ def _check_folder(
     names += [DATABASE] if options.colmap_database else []
     check_writable(*(folder / file for file in names), overwrite=overwrite)
     return tuple(names)
-
-
-def _write_database(
-    vi_map: VIMap,
-    exported: ExportedModel,
-    options: ColmapExportOptions,
-    work: Path,
-    folder: Path,
-    *,
-    overwrite: bool,
-) -> None:
-    arrays: dict[str, Any] = database_arrays(vi_map, exported)
-    if options.colmap_pose_priors:
-        arrays["priors"] = np.ones(1)
-    np.savez(work / "database.npz", **arrays)
-    child_process.run_job("database", work, folder / DATABASE)
-    copy_file(work / DATABASE, folder / DATABASE, overwrite=overwrite)
-
-
-_MAX_GAP = 50
-"""Pairs of images are matched up to this many observations of a landmark apart."""
-_MIN_MATCHES = 15
-"""COLMAP's least number of inliers of a pair."""
-
-
-def database_arrays(vi_map: VIMap, exported: ExportedModel) -> dict[str, NDArray[Any]]:
-    """Return the columns of the database by name.
-
-    Keypoints are float32 as COLMAP stores them: x, y, scale, orientation (0).
-    """
-    images = exported.model.images
-    keypoints = np.zeros((len(images.uv), 4), dtype=np.float32)
-    keypoints[:, :2] = images.uv
-    scale = vi_map.keypoints.scale[exported.keypoints]
-    keypoints[:, 2] = np.where(scale > 0.0, scale, 1.0)
-    size, is_sift = _descriptor_sizes(vi_map, exported.frames)
-    pairs, start, matches = matches_of_landmarks(exported)
-    return {
-        "images": images.id,
-        "keypoint_start": images.keypoint_start,
-        "keypoints": keypoints,
-        "descriptors": vi_map.keypoints.descriptor[exported.keypoints],
-        "descriptor_bytes": size,
-        "is_sift": is_sift,
-        "pairs": pairs,
-        "match_start": start,
-        "matches": matches,
-    }
-
-
-def _descriptor_sizes(vi_map: VIMap, frames: I64) -> tuple[I64, NDArray[np.bool_]]:
-    """Return the bytes (N,) of each frame's descriptors, and whether they are SIFT.
-
-    COLMAP has one kind of descriptor in an image; frames with several get 0.
-    """
-    blocks = vi_map.frames.descriptor_blocks[frames]
-    kinds = [{block[1:] for block in of_frame or () if block.keypoints} for of_frame in blocks]
-    single = [next(iter(kind)) if len(kind) == 1 else (0, 0, 0) for kind in kinds]
-    size = np.array([entry[0] for entry in single], dtype=np.int64)
-    sift = (DescriptorDepth.UINT8, FeatureType.SIFT)
-    return size, np.array([entry[1:] == sift for entry in single], dtype=np.bool_)
-
-
-def matches_of_landmarks(exported: ExportedModel) -> tuple[I64, I64, NDArray[np.uint32]]:
-    """Return pairs of image ids (P, 2), offsets (P + 1,), and matched keypoints (sum, 2).
-
-    Two images match in the keypoints that observe the same landmark; pairs with few matches are left
-    out.
-    """
-    images = exported.model.images
-    observing = np.flatnonzero(images.point != colmap.NO_POINT)
-    observing = observing[np.argsort(images.point[observing], kind="stable")]
-    point, image = images.point[observing], images.keypoint_image[observing]
-    keypoint = observing - images.keypoint_start[image]
-    parts = []
-    for gap in range(1, _MAX_GAP + 1):
-        a = np.flatnonzero(point[gap:] == point[:-gap])
-        if not len(a):
-            break
-        a = a[image[a] != image[a + gap]]
-        ends = np.stack([image[a], image[a + gap], keypoint[a], keypoint[a + gap]], axis=1)
-        parts.append(ends)
-    table = np.concatenate(parts) if parts else np.zeros((0, 4), dtype=np.int64)
-    table = table[np.lexsort((table[:, 3], table[:, 2], table[:, 1], table[:, 0]))]
-    pairs, count = np.unique(table[:, :2], axis=0, return_counts=True)
-    kept = count >= _MIN_MATCHES
-    table = table[np.repeat(kept, count)]
-    return images.id[pairs[kept]], starts_of_counts(count[kept]), table[:, 2:].astype(np.uint32)
 
 
 _GREY = 128

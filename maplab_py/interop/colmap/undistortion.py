@@ -1,18 +1,17 @@
 """Perspective cameras and undistorted keypoints, of models to import and of maps to export."""
 
 import dataclasses
-import tempfile
 from pathlib import Path
 
 import numpy as np
 
-from maplab_py.array_types import I64
+from maplab_py.array_types import I64, Mask
 from maplab_py.errors import UserError
-from maplab_py.interop.colmap import child_process
+from maplab_py.interop.colmap import pycolmap_files
 from maplab_py.interop.colmap.model import MODELS, NO_POINT, ColmapCamera, ColmapModel, has_model
 from maplab_py.sensors import Camera, CameraRig, SensorSet, projection
 from maplab_py.sensors.camera import Distortion, Projection
-from maplab_py.vimap import MissionSensor, VIMap, mission_sensor_id, ragged_rows, starts_of_counts
+from maplab_py.vimap import MissionSensor, VIMap, mission_sensor_id, ragged_rows
 
 _PINHOLE = 1
 _LARGEST_TANGENT = 10.0
@@ -33,30 +32,16 @@ def perspective_model(model: ColmapModel, folder: Path) -> ColmapModel:
             raise UserError(
                 f"{folder}: camera {camera.id} is EQUIRECTANGULAR: no perspective image shows it"
             )
-    rows = [
-        ragged_rows(images.keypoint_start, np.flatnonzero(images.camera == camera.id))
-        for camera in cameras
-    ]
-    start = starts_of_counts(np.array([len(part) for part in rows]))
-    chosen = np.concatenate(rows)
-    numbers = np.array([camera.id for camera in cameras])
-    with tempfile.TemporaryDirectory(prefix="maplab-colmap-") as name:
-        work = Path(name)
-        child_process.write_job_model(model, work)
-        np.savez(work / "pixels.npz", uv=images.uv[chosen], start=start, cameras=numbers)
-        child_process.run_job("undistort", work, folder)
-        with np.load(work / "undistorted.npz", allow_pickle=False) as result:
-            rays = result["rays"]
     new = {camera.id: _pinhole(camera) for camera in cameras}
     uv, point = images.uv.copy(), images.point.copy()
-    seen = np.isfinite(rays).all(axis=1)
-    seen &= np.linalg.norm(np.where(seen[:, None], rays, 0.0), axis=1) < _LARGEST_TANGENT
-    for row, camera in enumerate(cameras):
-        part = slice(start[row], start[row + 1])
+    for camera in cameras:
+        mine = ragged_rows(images.keypoint_start, np.flatnonzero(images.camera == camera.id))
+        rays = pycolmap_files.rays_of(camera, uv[mine])
+        seen: Mask = np.asarray(np.isfinite(rays).all(axis=1))
+        seen &= np.linalg.norm(np.where(seen[:, None], rays, 0.0), axis=1) < _LARGEST_TANGENT
         values = new[camera.id].parameters
-        pixels = rays[part] * values[:2] + values[2:]
-        uv[rows[row]] = np.where(seen[part, None], pixels, -1.0)
-    point[chosen[~seen]] = NO_POINT
+        uv[mine] = np.where(seen[:, None], rays * values[:2] + values[2:], -1.0)
+        point[mine[~seen]] = NO_POINT
     return dataclasses.replace(
         model,
         cameras=tuple(new.get(camera.id, camera) for camera in model.cameras),
