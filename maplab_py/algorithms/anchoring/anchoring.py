@@ -23,7 +23,6 @@ from maplab_py.algorithms.anchoring.options import (
 from maplab_py.algorithms.anchoring.pairs import (
     USED,
     Pair,
-    Sightings,
     align_pairs,
     consistent,
     fit_missions,
@@ -33,6 +32,10 @@ from maplab_py.algorithms.anchoring.pairs import (
 from maplab_py.algorithms.landmarks.quality import evaluate_unknown_quality
 from maplab_py.algorithms.loop_closure import ambiguity, features, record_updates, workflow
 from maplab_py.algorithms.loop_closure.detection import Detection, detect
+from maplab_py.algorithms.loop_closure.mission_alignment import (
+    PairedClosures,
+    ordered_by_mission,
+)
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.errors import UserError
@@ -98,7 +101,7 @@ def anchor_missions(
     )
     used = [p.sightings for p in pairs if p.verdict == USED and reached[p.a] and reached[p.b]]
     if used:
-        T_G_M = fit_missions(_join(used), T_G_M, known | ~reached)
+        T_G_M = fit_missions(PairedClosures.concatenate(used), T_G_M, known | ~reached)
     alignments = [_describe(pair, names) for pair in pairs]
     anchored = reached & wanted
     report = AnchoringReport(
@@ -181,29 +184,20 @@ def _describe(pair: Pair, names: list[str]) -> MissionAlignment:
     )
 
 
-def _sightings(vi_map: VIMap, detection: Detection) -> Sightings:
+def _sightings(vi_map: VIMap, detection: Detection) -> PairedClosures:
     """Return the accepted closures with the smaller mission row as A, whichever was the query."""
     c = detection.closures
-    rows = np.flatnonzero(c.accepted)
-    query, place = c.query_vertex[rows], c.place_vertex[rows]
+    c = c.take(c.accepted)
     mission = vi_map.vertices.mission.astype(np.int64)
-    T_A_I, T_B_I = vi_map.vertices.T_M_I[query].copy(), c.T_M_I[rows].copy()
-    A, B = mission[query], mission[place]
-    swapped = A > B
-    T_A_I[swapped], T_B_I[swapped] = T_B_I[swapped], T_A_I[swapped]
-    return Sightings(
-        mission_A=np.minimum(A, B),
-        mission_B=np.maximum(A, B),
-        T_A_I=T_A_I,
-        T_B_I=T_B_I,
-        weight=c.inliers[rows].astype(np.float64),
-    )
+    ends = mission[c.query_vertex], mission[c.place_vertex]
+    columns = ordered_by_mission(ends, (vi_map.vertices.T_M_I[c.query_vertex], c.T_M_I))
+    return PairedClosures(c.inliers.astype(np.float64), *columns)
 
 
 def _align(
     T_G_M: F64,
     known: NDArray[np.bool_],
-    sightings: Sightings,
+    sightings: PairedClosures,
     undecided: dict[tuple[int, int], str],
     options: AnchoringOptions,
     names: list[str],
@@ -213,16 +207,11 @@ def _align(
     pairs = align_pairs(sightings, undecided, options, wanted)
     T, reached, pairs = _spread(T_G_M, known, consistent(pairs, options, names), options)
     joined = np.unique(np.concatenate([sightings.mission_A, sightings.mission_B]))
-    is_complete = len(wanted) == len(np.unique(_pair_keys(sightings)))
+    is_complete = len(wanted) == len(sightings.rows_of_pairs())
     if is_complete or reached[joined].all():
         return T, reached, pairs
     pairs = consistent(align_pairs(sightings, undecided, options), options, names)
     return _spread(T_G_M, known, pairs, options)
-
-
-def _pair_keys(sightings: Sightings) -> I64:
-    size = int(sightings.mission_B.max(initial=0)) + 1
-    return np.asarray(sightings.mission_A * size + sightings.mission_B)
 
 
 def _spread(
@@ -263,15 +252,6 @@ def _against_tree(
     if fits(pair, T_B_A, options):
         return pair
     return dataclasses.replace(pair, verdict="contradicts stronger alignments")
-
-
-def _join(parts: list[Sightings]) -> Sightings:
-    return Sightings(
-        *(
-            np.concatenate([getattr(part, field.name) for part in parts])
-            for field in dataclasses.fields(Sightings)
-        )
-    )
 
 
 def _why_not(  # type: ignore[no-untyped-def]

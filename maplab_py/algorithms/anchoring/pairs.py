@@ -7,8 +7,9 @@ import dataclasses
 import numpy as np
 
 from maplab_py.algorithms.anchoring.options import AnchoringOptions
-from maplab_py.array_types import F64, I64, Mask, Rows
-from maplab_py.geometry import se3, yaw
+from maplab_py.algorithms.loop_closure.mission_alignment import PairedClosures
+from maplab_py.array_types import F64, Mask
+from maplab_py.geometry import yaw
 
 USED = "used"
 _PAIRS_PER_MISSION = 10
@@ -23,7 +24,7 @@ class Pair:
     a: int
     b: int
     T_B_A: F64  # yaw and position (4,)
-    sightings: Sightings  # that agree with it
+    sightings: PairedClosures  # that agree with it
     closures: int  # accepted ones between the two
     verdict: str = USED  # or the reason why not
 
@@ -40,7 +41,7 @@ class Pair:
 
 
 def align_pairs(
-    sightings: Sightings,
+    sightings: PairedClosures,
     undecided: dict[tuple[int, int], str],
     options: AnchoringOptions,
     wanted: set[tuple[int, int]] | None = None,
@@ -53,7 +54,7 @@ def align_pairs(
         options: When two missions count as aligned.
         wanted: The pairs to align; None = all.
     """
-    rows = _rows_of_pairs(sightings)
+    rows = sightings.rows_of_pairs()
     pairs = []
     for a, b in sorted({*rows, *undecided}):
         mine = rows.get((a, b), np.zeros(0, dtype=np.int64))
@@ -67,13 +68,13 @@ def align_pairs(
     return pairs
 
 
-def strongest_pairs(sightings: Sightings, missions: int) -> set[tuple[int, int]]:
+def strongest_pairs(sightings: PairedClosures, missions: int) -> set[tuple[int, int]]:
     """Return the strongest pairs of each mission and a maximum spanning forest of all.
 
     Their number is in proportion to the missions, where that of all pairs grows with the square. In
     a map of few missions they are all pairs.
     """
-    rows = _rows_of_pairs(sightings)
+    rows = sightings.rows_of_pairs()
     ranked = sorted(rows, key=lambda pair: (-float(sightings.weight[rows[pair]].sum()), pair))
     count = np.zeros(missions, dtype=np.int64)
     root = list(range(missions))
@@ -91,18 +92,6 @@ def strongest_pairs(sightings: Sightings, missions: int) -> set[tuple[int, int]]
             count[[a, b]] += 1
             chosen.add((a, b))
     return chosen
-
-
-def _rows_of_pairs(sightings: Sightings) -> dict[tuple[int, int], I64]:
-    """Return the rows of the closures of each pair of missions."""
-    size = int(sightings.mission_B.max(initial=0)) + 1
-    key = sightings.mission_A * size + sightings.mission_B
-    order = np.argsort(key, kind="stable")
-    parts = np.split(order, np.flatnonzero(np.diff(key[order])) + 1) if len(order) else []
-    return {
-        (int(sightings.mission_A[rows[0]]), int(sightings.mission_B[rows[0]])): rows
-        for rows in parts
-    }
 
 
 def _fit(pair: Pair) -> Pair:
@@ -193,7 +182,7 @@ def fits(pair: Pair, T_B_A: F64, options: AnchoringOptions) -> bool:
     )
 
 
-def _gaps(T_B_A: F64, sightings: Sightings) -> F64:
+def _gaps(T_B_A: F64, sightings: PairedClosures) -> F64:
     """Return the distances (N,) [m] between the two ends of closures."""
     gap = yaw.transform(T_B_A, sightings.T_A_I[:, 4:]) - sightings.T_B_I[:, 4:]
     return np.asarray(np.linalg.norm(gap, axis=1))
@@ -206,18 +195,7 @@ _CONVERGED = 1e-10
 """Largest change [m, rad] of a step after which the fit ends."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Sightings(Rows):
-    """Closures between missions: vertex poses in the query's mission A and in the place's mission B."""
-
-    mission_A: I64  # (N,)
-    mission_B: I64  # (N,)
-    T_A_I: F64  # (N, 7)
-    T_B_I: F64  # (N, 7)
-    weight: F64  # (N,) inliers
-
-
-def agreeing(sightings: Sightings, options: AnchoringOptions) -> tuple[F64, Mask]:
+def agreeing(sightings: PairedClosures, options: AnchoringOptions) -> tuple[F64, Mask]:
     """Align one pair of missions: the hypothesis of the closure that most inliers support.
 
     Every closure is a hypothesis (yaw and position), so the result depends on nothing but the
@@ -226,7 +204,7 @@ def agreeing(sightings: Sightings, options: AnchoringOptions) -> tuple[F64, Mask
     Returns:
         T_B_A as yaw and position (4,), and which closures agree with it (N,).
     """
-    E = yaw.from_pose(se3.compose(sightings.T_B_I, se3.inverse(sightings.T_A_I)))
+    E = sightings.T_B_A
     p = yaw.transform(E[:, None], sightings.T_A_I[None, :, 4:])  # hypothesis, closure
     distance = np.linalg.norm(p - sightings.T_B_I[None, :, 4:], axis=2)
     turn = np.abs(yaw.wrap(E[:, None, 3] - E[None, :, 3]))
@@ -237,7 +215,7 @@ def agreeing(sightings: Sightings, options: AnchoringOptions) -> tuple[F64, Mask
     return E[best], np.asarray(agree[best])
 
 
-def fit_missions(sightings: Sightings, start: F64, fixed: Mask) -> F64:
+def fit_missions(sightings: PairedClosures, start: F64, fixed: Mask) -> F64:
     """Estimate T_G_M (M, 4: position and yaw) of missions by robust least squares over the closures.
 
     Gauss-Newton with the weights of the loss 2 (sqrt(1 + r^2) - 1) of each whitened residual r.
@@ -251,7 +229,7 @@ def fit_missions(sightings: Sightings, start: F64, fixed: Mask) -> F64:
     free = np.flatnonzero(~fixed)
     if len(free) == 0 or len(sightings.weight) == 0:
         return start
-    relative_yaw = yaw.from_pose(se3.compose(sightings.T_B_I, se3.inverse(sightings.T_A_I)))[:, 3]
+    relative_yaw = sightings.T_B_A[:, 3]
     weight = sightings.weight / sightings.weight.mean()
     fitted = start.copy()
     unknown = (4 * free[:, None] + np.arange(4)).ravel()
@@ -271,7 +249,7 @@ def fit_missions(sightings: Sightings, start: F64, fixed: Mask) -> F64:
     return fitted
 
 
-def _residuals(s: Sightings, T_G_M: F64, relative_yaw: F64) -> tuple[F64, F64, F64]:
+def _residuals(s: PairedClosures, T_G_M: F64, relative_yaw: F64) -> tuple[F64, F64, F64]:
     """Return whitened residuals (N, 4) and their derivatives (N, 4, 4) by the poses of A and B."""
     A, B = T_G_M[s.mission_A], T_G_M[s.mission_B]
     p_A, p_B = yaw.rotate(A[:, 3], s.T_A_I[:, 4:]), yaw.rotate(B[:, 3], s.T_B_I[:, 4:])
@@ -290,7 +268,7 @@ def _residuals(s: Sightings, T_G_M: F64, relative_yaw: F64) -> tuple[F64, F64, F
 
 
 def _normal_equations(
-    s: Sightings, residual: F64, J_A: F64, J_B: F64, robust: F64, missions: int
+    s: PairedClosures, residual: F64, J_A: F64, J_B: F64, robust: F64, missions: int
 ) -> tuple[F64, F64]:
     """Return the matrix (4M, 4M) and the gradient (4M,) of all missions."""
     H = np.zeros((missions, missions, 4, 4))

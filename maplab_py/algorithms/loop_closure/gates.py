@@ -208,15 +208,13 @@ class Judgement:
         return np.asarray(self.values.correction_m > drift_m)
 
     @functools.cached_property
-    def paired(self) -> mission_alignment.PairedClosures:
+    def paired(self) -> mission_alignment.LocatedClosures:
         """The closures as relative poses of their missions."""
-        return mission_alignment.PairedClosures.of(
-            self.missions,
-            (self.vi_map.vertices.T_M_I[self.query], self.T_M_I),
-            self.way_m,
-            (self.stretch[self.query], self.stretch[self.place]),
-            self.values.inliers.astype(np.float64),
-        )
+        poses = self.vi_map.vertices.T_M_I[self.query], self.T_M_I
+        stretches = self.stretch[self.query], self.stretch[self.place]
+        columns = mission_alignment.ordered_by_mission(self.missions, poses, self.way_m, stretches)
+        weight = self.values.inliers.astype(np.float64)
+        return mission_alignment.LocatedClosures(weight, *columns)
 
 
 def judge(

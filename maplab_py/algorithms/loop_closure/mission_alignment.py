@@ -9,10 +9,12 @@ trajectories (`stretches`), because an alignment is a statement about both missi
 from __future__ import annotations
 
 import dataclasses
+import functools
+from typing import Any
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64, Mask, Rows
+from maplab_py.array_types import F64, I64, Mask, NDArray, Rows
 from maplab_py.geometry import se3, so3, yaw
 from maplab_py.vimap import VIMap
 
@@ -32,32 +34,55 @@ _MAX_TURN_RAD = 0.3
 class PairedClosures(Rows):
     """Closures (N,) between missions; A is the mission with the smaller row."""
 
+    weight: F64  # inliers
     mission_A: I64
     mission_B: I64
     T_A_I: F64  # (N, 7) pose of the query in both missions
     T_B_I: F64  # (N, 7)
+
+    @functools.cached_property
+    def T_B_A(self) -> F64:
+        """Frame A in frame B as position and yaw (N, 4)."""
+        return yaw.from_pose(se3.compose(self.T_B_I, se3.inverse(self.T_A_I)))
+
+    def rows_of_pairs(self, rows: I64 | None = None) -> dict[tuple[int, int], I64]:
+        """Return the closures (of some rows, None = all) of each pair of missions."""
+        rows = np.arange(len(self)) if rows is None else rows
+        key = self.mission_A * (int(self.mission_B.max(initial=0)) + 1) + self.mission_B
+        rows = rows[np.argsort(key[rows], kind="stable")]
+        parts = np.split(rows, np.flatnonzero(np.diff(key[rows])) + 1)
+        return {
+            (int(self.mission_A[part[0]]), int(self.mission_B[part[0]])): part
+            for part in parts
+            if len(part)
+        }
+
+
+def ordered_by_mission(
+    mission: tuple[I64, I64], *ends: tuple[NDArray[Any], NDArray[Any]]
+) -> list[NDArray[Any]]:
+    """Return values at both ends of closures, given as (the query's, the place's), of A and of B.
+
+    Args:
+        mission: Missions (N,), which come first.
+        ends: Values (N, ...) at the ends.
+    """
+    swapped = mission[0] > mission[1]
+    columns: list[NDArray[Any]] = []
+    for query, place in (mission, *ends):
+        is_swapped = swapped.reshape(-1, *[1] * (query.ndim - 1))
+        columns += [np.where(is_swapped, place, query), np.where(is_swapped, query, place)]
+    return columns
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class LocatedClosures(PairedClosures):
+    """Closures (N,) between missions with the places of their ends along the trajectories."""
+
     way_A_m: F64  # arc length along the missions to the ends of the closure
     way_B_m: F64
     stretch_A: I64  # stretches of the trajectories at the ends
     stretch_B: I64
-    weight: F64  # inliers
-
-    @classmethod
-    def of(
-        cls,
-        mission: tuple[I64, I64],
-        T_I: tuple[F64, F64],
-        way_m: tuple[F64, F64],
-        stretch: tuple[I64, I64],
-        weight: F64,
-    ) -> PairedClosures:
-        """Order the two ends of closures, given as (the query's, the place's), by mission."""
-        swapped = mission[0] > mission[1]
-        T_A_I, T_B_I = (np.where(swapped[:, None], T_I[1 - end], T_I[end]) for end in (0, 1))
-        way_A, way_B = (np.where(swapped, way_m[1 - end], way_m[end]) for end in (0, 1))
-        at_A, at_B = (np.where(swapped, stretch[1 - end], stretch[end]) for end in (0, 1))
-        first, second = np.minimum(*mission), np.maximum(*mission)
-        return cls(first, second, T_A_I, T_B_I, way_A, way_B, at_A, at_B, weight)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -94,23 +119,16 @@ class MissionPair:
         return self.mission_A, self.mission_B
 
 
-def alignments_of_pairs(closures: PairedClosures, candidate: Mask) -> list[MissionPair]:
+def alignments_of_pairs(closures: LocatedClosures, candidate: Mask) -> list[MissionPair]:
     """Return the alignments of every pair of missions that candidates (N,) join."""
-    rows = np.flatnonzero(candidate)
-    key = closures.mission_A * (int(closures.mission_B.max(initial=0)) + 1) + closures.mission_B
-    rows = rows[np.argsort(key[rows], kind="stable")]
-    # frame A in frame B
-    E = yaw.from_pose(se3.compose(closures.T_B_I, se3.inverse(closures.T_A_I)))
-    pairs = []
-    for mine in np.split(rows, np.flatnonzero(np.diff(key[rows])) + 1):
-        if len(mine):
-            alignments = _alignments(closures.take(mine), E[mine], mine)
-            ends = int(closures.mission_A[mine[0]]), int(closures.mission_B[mine[0]])
-            pairs.append(MissionPair(*ends, mine, alignments))
-    return pairs
+    rows = closures.rows_of_pairs(np.flatnonzero(candidate))
+    return [
+        MissionPair(*ends, mine, _alignments(closures.take(mine), mine))
+        for ends, mine in rows.items()
+    ]
 
 
-def _alignments(c: PairedClosures, E: F64, rows: I64) -> tuple[Alignment, ...]:
+def _alignments(c: LocatedClosures, rows: I64) -> tuple[Alignment, ...]:
     """Take the alignment with most support, remove its closures, and repeat; share them out at last."""
     from scipy.sparse import csr_array
 
@@ -123,7 +141,7 @@ def _alignments(c: PairedClosures, E: F64, rows: I64) -> tuple[Alignment, ...]:
     while len(left) and len(hypotheses) < _MAX_ALIGNMENTS:
         pick = np.linspace(0, len(left) - 1, min(len(left), _MAX_HYPOTHESES)).astype(np.int64)
         tried = left[np.unique(pick)]
-        agree = _error(E, c, tried, left) < 1.0
+        agree = _error(c, tried, left) < 1.0
         support = ((csr_array(agree.astype(np.int32)) @ sees[left]) > 0).sum(axis=1)
         best = int(np.lexsort((-(agree @ c.weight[left]), -support))[0])
         mine = left[agree[best]]
@@ -133,19 +151,19 @@ def _alignments(c: PairedClosures, E: F64, rows: I64) -> tuple[Alignment, ...]:
         hypotheses.append(int(tried[best]))
         left = left[~agree[best]]
     # drift allows for several alignments far from where they were found: the nearest is meant
-    error = _error(E, c, np.array(hypotheses, dtype=np.int64), np.arange(len(rows)))
+    error = _error(c, np.array(hypotheses, dtype=np.int64), np.arange(len(rows)))
     nearest = np.argmin(error, axis=0) if hypotheses else np.zeros(len(rows), dtype=np.int64)
     alignments = []
     for number, hypothesis in enumerate(hypotheses):
         mine = np.flatnonzero((nearest == number) & (error[number] < 1.0))
         stretches = np.unique(c.stretch_A[mine]), np.unique(c.stretch_B[mine])
-        alignments.append(Alignment(E[hypothesis], rows[mine], *stretches))
+        alignments.append(Alignment(c.T_B_A[hypothesis], rows[mine], *stretches))
     return tuple(sorted(alignments, key=lambda alignment: -alignment.support))
 
 
-def _error(E: F64, c: PairedClosures, hypothesis: I64, rows: I64) -> F64:
+def _error(c: LocatedClosures, hypothesis: I64, rows: I64) -> F64:
     """Return the errors (H, L) of closures under hypotheses; below 1 they agree."""
-    h = hypothesis[:, None]
+    h, E = hypothesis[:, None], c.T_B_A
     p_B = yaw.transform(E[h], c.T_A_I[None, rows, 4:])
     apart = np.linalg.norm(p_B - c.T_B_I[None, rows, 4:], axis=2)
     between = np.abs(c.way_A_m[rows] - c.way_A_m[h]) + np.abs(c.way_B_m[rows] - c.way_B_m[h])

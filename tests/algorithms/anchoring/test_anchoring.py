@@ -1,5 +1,6 @@
 """Base frames of missions: from pairs, over trees of missions, against rooms that look alike."""
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -9,6 +10,7 @@ from maplab_py.algorithms.anchoring import pairs as anchor_pairs
 from maplab_py.algorithms.anchoring.absolute import AbsoluteAnchoringOptions
 from maplab_py.algorithms.anchoring.anchoring import anchor_missions
 from maplab_py.algorithms.anchoring.options import AnchoringOptions
+from maplab_py.algorithms.loop_closure.mission_alignment import PairedClosures
 from maplab_py.geometry import se3, so3, yaw
 from maplab_py.vimap import AbsolutePoses, to_hex
 from tests.algorithms.loop_closure.rooms import Walk, make_map
@@ -236,9 +238,9 @@ def sightings(counts, wrong=(), seed=0):
         B += [b] * count
         T_A_I.append(yaw.to_pose(own))
         T_B_I.append(yaw.to_pose(other))
-    return anchor_pairs.Sightings(
-        np.array(A), np.array(B), np.concatenate(T_A_I), np.concatenate(T_B_I),
-        np.full(len(A), 30.0),
+    return PairedClosures(
+        np.full(len(A), 30.0), np.array(A), np.array(B), np.concatenate(T_A_I),
+        np.concatenate(T_B_I),
     )  # fmt: skip
 
 
@@ -294,7 +296,7 @@ def test_too_few_or_too_divided_closures_are_no_alignment():
     moved = T.T_B_I.copy()
     moved[::2, 4:] += np.random.default_rng(1).uniform(5, 50, (15, 3))
     moved[::3, 4:] -= np.random.default_rng(2).uniform(5, 50, (10, 3))
-    divided = anchor_pairs.Sightings(T.mission_A, T.mission_B, T.T_A_I, moved, T.weight)
+    divided = dataclasses.replace(T, T_B_I=moved)
     assert "closures agree" in anchor_pairs.align_pairs(divided, {}, OPTIONS)[0].verdict
 
 
@@ -311,7 +313,7 @@ def test_of_many_missions_each_keeps_its_strongest_pairs_and_none_is_cut_off():
     A, B = np.array(pairs + chain).T
     weight = np.append(np.random.default_rng(0).uniform(10.0, 50.0, len(pairs)), [1.0, 1.0, 1.0])
     T = np.tile([0.0, 0, 0, 1, 0, 0, 0], (len(A), 1))
-    chosen = anchor_pairs.strongest_pairs(anchor_pairs.Sightings(A, B, T, T, weight), count + 3)
+    chosen = anchor_pairs.strongest_pairs(PairedClosures(weight, A, B, T, T), count + 3)
     assert set(chain) <= chosen
     assert 10 * count / 2 <= len(chosen) <= 10 * count + 3
     strongest = max(range(len(pairs)), key=lambda i: weight[i])

@@ -17,8 +17,9 @@ from maplab_py.algorithms.loop_closure.ambiguity import (
 from maplab_py.algorithms.loop_closure.features import map_features
 from maplab_py.algorithms.loop_closure.matching import SearchMemory, match_features
 from maplab_py.algorithms.loop_closure.mission_alignment import (
-    PairedClosures,
+    LocatedClosures,
     alignments_of_pairs,
+    ordered_by_mission,
 )
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.workflow import search_loops
@@ -62,7 +63,7 @@ def so3_identity(count: int) -> np.ndarray:
     return np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))
 
 
-def closures(way_m, alignment, *, mission=(0, 1), noise_m=0.05, drift=0.0) -> PairedClosures:
+def closures(way_m, alignment, *, mission=(0, 1), noise_m=0.05, drift=0.0) -> LocatedClosures:
     """Return closures of queries that walk frame A's x axis; each tells the given T_B_A."""
     way = np.asarray(way_m, dtype=float)
     rng = np.random.default_rng(len(way))
@@ -76,15 +77,15 @@ def closures(way_m, alignment, *, mission=(0, 1), noise_m=0.05, drift=0.0) -> Pa
         (100 * m + np.floor(w)).astype(np.int64) for m, w in zip(mission, (way, way_B), strict=True)
     )
     ends = tuple(np.full(len(way), m) for m in mission)
-    return PairedClosures.of(ends, (T_A_I, T_B_I), (way, way_B), stretch, np.full(len(way), 40.0))
+    columns = ordered_by_mission(ends, (T_A_I, T_B_I), (way, way_B), stretch)
+    return LocatedClosures(np.full(len(way), 40.0), *columns)
 
 
-def join(*parts: PairedClosures) -> PairedClosures:
-    names = [field.name for field in dataclasses.fields(PairedClosures)]
-    return PairedClosures(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
+def join(*parts: LocatedClosures) -> LocatedClosures:
+    return LocatedClosures.concatenate(parts)
 
 
-def contests(c: PairedClosures, missions: int = 2):
+def contests(c: LocatedClosures, missions: int = 2):
     vi_map = lines(missions)
     pairs = alignments_of_pairs(c, np.ones(len(c.weight), dtype=bool))
     stretch = np.concatenate([100 * m + np.arange(60) for m in range(missions)])
@@ -152,16 +153,14 @@ def test_drift_along_the_way_is_no_contradiction():
 
 def test_direction_of_the_search_does_not_matter():
     forth = closures(metres(0, 20), HERE)
-    ends = (forth.mission_B, forth.mission_A)
-    back = PairedClosures.of(
-        ends,
-        (forth.T_B_I, forth.T_A_I),
-        (forth.way_B_m, forth.way_A_m),
-        (forth.stretch_B, forth.stretch_A),
-        forth.weight,
+    forwards = (
+        (forth.mission_A, forth.mission_B),
+        (forth.T_A_I, forth.T_B_I),
+        (forth.way_A_m, forth.way_B_m),
     )
-    for field in dataclasses.fields(PairedClosures):
-        np.testing.assert_array_equal(getattr(back, field.name), getattr(forth, field.name))
+    back = ordered_by_mission(*(ends[::-1] for ends in forwards))
+    for ordered, column in zip(back, (each for ends in forwards for each in ends), strict=True):
+        np.testing.assert_array_equal(ordered, column)
 
 
 def test_pairs_are_judged_one_by_one():
