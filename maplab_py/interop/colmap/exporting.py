@@ -56,7 +56,7 @@ def export_colmap(
     model = exported.model
     with tempfile.TemporaryDirectory(prefix="maplab-colmap-") as work:
         if options.colmap_format == "text":
-            pycolmap_files.write_text(model, Path(work), folder, overwrite=overwrite)
+            pycolmap_files.write_text_model(model, Path(work), folder, overwrite=overwrite)
         else:
             for file, content in writing.binary_files(model).items():
                 write_bytes(folder / file, content, overwrite=overwrite)

@@ -1,4 +1,4 @@
-"""What pycolmap does: models in text, databases, and cameras that maplab lacks.
+"""Uses of pycolmap: models in text, databases, and cameras that maplab lacks.
 
 Some other functions of it abort a process that has imported cv2.
 """
@@ -37,7 +37,7 @@ class Features:
     keypoints: I64  # (K,) rows
 
 
-def write_text(
+def write_text_model(
     model: colmap.ColmapModel, work: Path, folder: Path, *, overwrite: bool = False
 ) -> None:
     """Write the text files of a model; `work` is an empty folder.

@@ -197,10 +197,10 @@ def attach_clouds(
     new = NewResources(seed=vi_map.missions.id[mission].tobytes())
     kept: list[int] = []
     problem: EmptyCloud | None = None
-    for row, read_one in zip(chosen.tolist(), read(chosen), strict=True):
+    for row, load in zip(chosen.tolist(), read(chosen), strict=True):
         progress.step(len(kept), len(chosen), "point clouds")
         try:
-            cloud = read_one()
+            cloud = load()
         except EmptyCloud as error:
             problem = problem or error
             continue
