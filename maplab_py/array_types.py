@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Any, ClassVar, Self, dataclass_transform
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +20,14 @@ Mask = NDArray[np.bool_]
 __all__ = ["F32", "F64", "I8", "I32", "I64", "U8", "U32", "U64", "Mask", "NDArray", "Rows"]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclass_transform(frozen_default=True, eq_default=False)
 class Rows:
-    """Base of dataclasses whose arrays share their first axis; fields that are no arrays are of all rows."""
+    """Base of frozen dataclasses whose arrays share their first axis; other fields are of all rows."""
+
+    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
+
+    def __init_subclass__(cls) -> None:
+        dataclasses.dataclass(frozen=True, eq=False)(cls)
 
     def __len__(self) -> int:
         values = vars(self)

@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, dataclass_transform
 
 import numpy as np
 
@@ -15,13 +15,18 @@ SCHEMA_VERSION = 1
 """Version of the JSON that --json prints; it rises when a field changes its meaning or goes."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))
 class Report:
-    """Base of every report. Subclasses are frozen dataclasses; fields are the facts.
+    """Base of every report: makes each a frozen dataclass; fields are the facts.
 
     A report that describes a failure (an inconsistent map, an empty result) overrides `failure`:
     the console then prints the report and the command's status is 1.
     """
+
+    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
+
+    def __init_subclass__(cls) -> None:
+        dataclasses.dataclass(frozen=True)(cls)
 
     @property
     def failure(self) -> str:
@@ -72,7 +77,6 @@ class Report:
         return f"<pre>{html.escape(text)}</pre>" if text is not None else to_html(to_json(shown))
 
 
-@dataclasses.dataclass(frozen=True)
 class Message(Report):
     """A report of one sentence."""
 

@@ -7,7 +7,6 @@ import numpy as np
 from maplab_py.array_types import F64, I64, Rows
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class Marks(Rows):
     source: str
     time_ns: I64

@@ -66,7 +66,6 @@ class Light:
     expected: str
 
 
-@dataclasses.dataclass(frozen=True)
 class MapHealth(Report):
     """Findings on a map, causes before effects."""
 

@@ -44,7 +44,6 @@ class LocalizationSummary:
     csv_file: Path | None
 
 
-@dataclasses.dataclass(frozen=True)
 class MappingReport(Report):
     """Estimates from a recording."""
 

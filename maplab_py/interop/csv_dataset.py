@@ -78,7 +78,6 @@ class CsvExportOptions(Options, prefix="csv_export_"):
     """Leave out landmarks that are not rated good, and their observations"""
 
 
-@dataclasses.dataclass(frozen=True)
 class CsvExportReport(Report):
     """Written files and numbers of rows."""
 

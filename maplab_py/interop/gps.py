@@ -5,7 +5,6 @@ NMEA: sentences GGA of any talker have the fixes, or GNS where there are none, R
 no fixes are left out and counted by reason.
 """
 
-import dataclasses
 import datetime as dt
 import functools
 import operator
@@ -51,7 +50,6 @@ _MOST = 0.5
 _DAY_NS = 86_400_000_000_000
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class GpsTrack(Rows):
     """Fixes on WGS 84 in the order of time."""
 

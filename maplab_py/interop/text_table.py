@@ -1,6 +1,5 @@
 """Fast reading and writing of text tables of numbers whose first column is a time stamp."""
 
-import dataclasses
 import datetime as dt
 import re
 import warnings
@@ -57,7 +56,6 @@ UNITS_OF = {
 """Units of each quantity, as they stand in the brackets of a header without blanks and signs of powers."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class TextTable(Rows):
     """Rows of a text file whose first column is a time stamp."""
 

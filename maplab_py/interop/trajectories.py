@@ -58,7 +58,6 @@ _EUROC_STATE_HEADER = (
 )
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class Trajectory(Rows):
     """Stamped poses of a body B in a reference frame R, in the order of time."""
 

@@ -26,7 +26,6 @@ _ASL_HEADER = (
 )
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class VertexStates(nav_state.NavState):
     """States by mission, then time. S is the reference sensor, by default the IMU."""
 

@@ -10,7 +10,6 @@ Columns of movements sideways (y, dy, vy) may be missing. Angles are radians, di
 header says otherwise.
 """
 
-import dataclasses
 import re
 from pathlib import Path
 
@@ -47,7 +46,6 @@ _OPTIONAL = {"y", "dy", "vy"}
 _UNIT_TOLERANCE = 1e-2
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class WheelTrack(Rows):
     """Poses of the wheel sensor S in a frame O of its own, as far as the wheels know."""
 

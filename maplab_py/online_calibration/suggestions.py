@@ -123,7 +123,6 @@ class Suggestion:
     is_sufficient: bool  # afterwards all parameters are known as well as wanted
 
 
-@dataclasses.dataclass(frozen=True)
 class SuggestionReport(Report):
     """Motions that would teach most about the calibration, the best first, one after the other."""
 

@@ -43,7 +43,6 @@ class FailedTask:
     log: Path
 
 
-@dataclasses.dataclass(frozen=True)
 class PipelineReport(Report):
     """Result of a pipeline."""
 

@@ -132,7 +132,6 @@ class EventLine:
     event: str
 
 
-@dataclasses.dataclass(frozen=True)
 class ServerStatus(Report):
     """State of a map server and its map."""
 
@@ -155,7 +154,6 @@ class ServerStatus(Report):
     problem: str = ""
 
 
-@dataclasses.dataclass(frozen=True)
 class ServeReport(Report):
     """Work of a server until it stopped."""
 
@@ -176,7 +174,6 @@ class ServeReport(Report):
         return self.problem
 
 
-@dataclasses.dataclass(frozen=True)
 class DeletedMissions(Report):
     """Missions that the server has removed from its map."""
 
@@ -184,7 +181,6 @@ class DeletedMissions(Report):
     vertices: int
 
 
-@dataclasses.dataclass(frozen=True)
 class LookupReport(Report):
     """Position of a point of a robot's sensor in the global frame."""
 
@@ -196,7 +192,6 @@ class LookupReport(Report):
     p_G_sensor: tuple[float, float, float]
 
 
-@dataclasses.dataclass(frozen=True)
 class DenseMapReport(Report):
     """Points of a dense map in a sphere."""
 
@@ -205,14 +200,12 @@ class DenseMapReport(Report):
     output_file: Path | None = None
 
 
-@dataclasses.dataclass(frozen=True)
 class PushReport(Report):
     """A submap that was put into a spool."""
 
     folder: Path
 
 
-@dataclasses.dataclass(frozen=True)
 class PlayedRobots(Report):
     """Simulated submaps that were put into a spool."""
 

@@ -36,7 +36,6 @@ class CameraPoses:
     at_time: Callable[[F64], F64] | None = None  # poses (N, 7) at any times (N,)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class Detections(Rows):
     """Detections of one camera in all its images, sorted by image."""
 

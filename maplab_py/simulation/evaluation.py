@@ -30,7 +30,6 @@ class MissionError:
     yaw_deg: float  # yaw error likewise
 
 
-@dataclasses.dataclass(frozen=True)
 class MapErrors(Report):
     """Errors of a map against the truth."""
 

@@ -1,7 +1,5 @@
 """IMU measurements along a motion (Schneider 2019, section 7) with random-walk biases."""
 
-import dataclasses
-
 import numpy as np
 
 from maplab_py.array_types import F64, Rows
@@ -11,7 +9,6 @@ from maplab_py.simulation.scenario import ImuOptions
 from maplab_py.simulation.spline import MotionState
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class ImuRecording(Rows):
     """IMU samples and their true biases."""
 

@@ -20,7 +20,6 @@ class ScenarioLine:
     description: str
 
 
-@dataclasses.dataclass(frozen=True)
 class ScenarioList(Report):
     """The scenarios that come with the program."""
 
@@ -37,7 +36,6 @@ class SimulatedMap:
     landmarks: int
 
 
-@dataclasses.dataclass(frozen=True)
 class SimulatedMaps(Report):
     """All sessions of a scenario, and where the truth is."""
 
@@ -66,7 +64,6 @@ class DemoMission:
     anchoring_yaw_deg: float
 
 
-@dataclasses.dataclass(frozen=True)
 class DemoReport(Report):
     """Errors of three drifting sessions before and after the workflow."""
 

@@ -16,7 +16,6 @@ from maplab_py.geometry import se3, so3
 _BLEND = np.array([[5.0, 3.0, -3.0, 1.0], [1.0, 3.0, 3.0, -2.0], [0.0, 0.0, 0.0, 1.0]]) / 6.0
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class MotionState(Rows):
     """Motion of the body I at N times, expressed in the fixed frame G unless said otherwise."""
 

@@ -1,7 +1,5 @@
 """Rectangular surfaces and the landmarks on them."""
 
-import dataclasses
-
 import numpy as np
 
 from maplab_py.array_types import F64, Rows
@@ -14,7 +12,6 @@ _SURFACE_OFFSET_M = 1e-6
 """Distance of landmarks from their surface, so that it does not occlude them."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class Surfaces(Rows):
     """Rectangles: corner + a * side_u + b * side_v with a, b in [0, 1]."""
 

@@ -36,7 +36,6 @@ from maplab_py.vimap.number_repair import without_bad_numbers
 from maplab_py.vimap.tables import Frames
 
 
-@dataclasses.dataclass(frozen=True)
 class LoadReport(Report):
     """Result of loading a map."""
 

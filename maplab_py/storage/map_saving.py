@@ -1,6 +1,5 @@
 """Save a map folder: lossless, as C++ maplab writes it, and atomically."""
 
-import dataclasses
 import gzip
 import os
 import shutil
@@ -33,7 +32,6 @@ CARD_FILE = "card.html"
 _GZIP_LEVEL = 1
 
 
-@dataclasses.dataclass(frozen=True)
 class SaveReport(Report):
     """Result of saving a map."""
 

@@ -39,7 +39,6 @@ class Violation:
     where: tuple[str, ...]  # ids or rows of the first few
 
 
-@dataclasses.dataclass(frozen=True)
 class ConsistencyReport(Report):
     """All violated rules of a map."""
 

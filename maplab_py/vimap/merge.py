@@ -24,7 +24,6 @@ _UNIQUE_TABLES = {
 }
 
 
-@dataclasses.dataclass(frozen=True)
 class MergeReport(Report):
     """Missions and sensors added by a merge."""
 

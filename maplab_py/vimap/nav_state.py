@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,7 +9,6 @@ import numpy as np
 from maplab_py.array_types import F64, I64, Rows
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class NavState(Rows):
     """States of the IMU at N times, in the mission frame M."""
 

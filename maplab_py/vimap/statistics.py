@@ -73,7 +73,6 @@ class MapTotals:
     resources: int
 
 
-@dataclasses.dataclass(frozen=True)
 class MapStatistics(Report):
     """Report of `map_stats`."""
 
@@ -113,7 +112,6 @@ class MapStatistics(Report):
         return view({"missions": ""}, missions=lines, summary=summary)
 
 
-@dataclasses.dataclass(frozen=True)
 class MapDetails(MapStatistics):
     """Report of `map_stats` with everything that is known of the chosen missions."""
 
@@ -122,7 +120,6 @@ class MapDetails(MapStatistics):
         return self
 
 
-@dataclasses.dataclass(frozen=True)
 class CoobservabilityReport(Report):
     """Groups of missions that share landmarks."""
 

@@ -1,7 +1,5 @@
 """Append a submap to its mission; neighbouring submaps share their boundary vertex."""
 
-import dataclasses
-
 import numpy as np
 
 from maplab_py.array_types import I64
@@ -17,7 +15,6 @@ _ALIGNED_M = 1e-9
 """Shared vertices that differ by less [m, rad] need no alignment."""
 
 
-@dataclasses.dataclass(frozen=True)
 class AppendReport(Report):
     """Result of appending submaps."""
 

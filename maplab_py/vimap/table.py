@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Any, ClassVar, Self, dataclass_transform
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -21,9 +21,14 @@ def column(dtype: DTypeLike, *shape: int, fill: Any = 0) -> Any:
     return dataclasses.field(metadata={"dtype": np.dtype(dtype), "shape": shape, "fill": fill})
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(column,))
 class Table:
     """Base of all tables. Columns are read-only: an edit makes a new table that shares the rest."""
+
+    __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
+
+    def __init_subclass__(cls) -> None:
+        dataclasses.dataclass(frozen=True, eq=False)(cls)
 
     def __post_init__(self) -> None:
         """Check dtypes and shapes, and lock the columns against writing."""
@@ -150,7 +155,6 @@ def starts_of_counts(counts: NDArray[Any]) -> NDArray[np.int64]:
     return start
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class Groups(Rows):
     """Base of dataclasses of groups (N) of items (CSR): the fields `items` have one row per item."""
 

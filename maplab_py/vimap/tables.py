@@ -7,7 +7,6 @@ References between tables are row numbers (int32), `NO_ROW` where there is none.
 `unknown` keep, per row, the serialised fields of newer or foreign writers.
 """
 
-import dataclasses
 from enum import IntEnum
 from typing import Any
 
@@ -72,7 +71,6 @@ class ResourceOwner(IntEnum):
     SENSOR = 3
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class BaseFrames(Table):
     """T_G_M of missions."""
 
@@ -83,7 +81,6 @@ class BaseFrames(Table):
     unknown: NDArray[Any] = column(object, fill=b"")
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class Missions(Table):
     """Missions: one recording session each."""
 
@@ -96,7 +93,6 @@ class Missions(Table):
     name: NDArray[Any] = column(object, fill="")  # for people; empty = none
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class Vertices(Table):
     """States along a mission. Invariant: rows sorted by mission row, then along the graph (time)."""
 
@@ -111,7 +107,6 @@ class Vertices(Table):
     unknown: NDArray[Any] = column(object, fill=b"")
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class Frames(Table):
     """Images of vertices. Invariant: sorted by vertex row, then camera index.
 
@@ -144,7 +139,6 @@ class FrameField(IntEnum):
     LANDMARK_ID = 32
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class Keypoints(Table):
     """Image measurements, grouped by frame. `landmark` IS the observation; there is no other copy."""
 
@@ -158,7 +152,6 @@ class Keypoints(Table):
     time_offset_ns: NDArray[np.int32] = column(np.int32, -1)  # (K, 1) or (K, 0), likewise
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class Landmarks(Table):
     """Landmarks. `p_I` is in the body frame of the vertex that stores the landmark."""
 
@@ -171,7 +164,6 @@ class Landmarks(Table):
     unknown: NDArray[Any] = column(object, fill=b"")
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class ImuEdges(Table):
     """Inertial edges between consecutive vertices, owners of consecutive rows of `ImuSamples`."""
 
@@ -182,7 +174,6 @@ class ImuEdges(Table):
     unknown: NDArray[Any] = column(object, fill=b"")
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class ImuSamples(Table):
     """IMU measurements; the first and last sample of an edge are at the times of its vertices."""
 
@@ -190,7 +181,6 @@ class ImuSamples(Table):
     accel_gyro: F64 = column(np.float64, 6)  # [ax ay az gx gy gz], m/s^2 and rad/s
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class TransformationEdges(Table):
     """Relative poses of a sensor S between two vertices: odometry, wheels, anything else."""
 
@@ -204,7 +194,6 @@ class TransformationEdges(Table):
     unknown: NDArray[Any] = column(object, fill=b"")
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class LoopClosureEdges(Table):
     """T_A_B takes the to-vertex' IMU frame (B) to the from-vertex' IMU frame (A)."""
 
@@ -218,7 +207,6 @@ class LoopClosureEdges(Table):
     unknown: NDArray[Any] = column(object, fill=b"")
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class AbsolutePoses(Table):
     """Absolute 6-DoF measurements T_G_S of a sensor, attached to the nearest vertex."""
 
@@ -230,7 +218,6 @@ class AbsolutePoses(Table):
     unknown: NDArray[Any] = column(object, fill=b"")
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class Resources(Table):
     """References to files in the map's resource folders."""
 

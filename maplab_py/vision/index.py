@@ -21,7 +21,6 @@ class DescriptorColumns(NamedTuple):
     time_ns: I64  # (N,)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class DescriptorSet(Rows):
     """Descriptors with the labels, sessions and times that restrict matches."""
 

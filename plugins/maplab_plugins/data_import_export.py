@@ -23,7 +23,6 @@ _ONLY_VERTICES = CsvExportOptions(
 )
 
 
-@dataclasses.dataclass(frozen=True)
 class WrittenFiles(Report):
     """Files that a command has written."""
 

@@ -49,7 +49,6 @@ class ReadParameter:
     value: float
 
 
-@dataclasses.dataclass(frozen=True)
 class CalibrationImport(Report):
     """Contents of a calibration file, and their use."""
 

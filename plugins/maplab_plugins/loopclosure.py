@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 _LOOPS = LoopClosureOptions()
 
 
-@dataclasses.dataclass(frozen=True)
 class RelaxReport(Report):
     """Detected loop closures, the result of the relaxation, and merged landmarks."""
 
@@ -53,7 +52,6 @@ class RelaxReport(Report):
         return "" if self.relaxation.num_loop_closures else "the map has no loop closures to relax"
 
 
-@dataclasses.dataclass(frozen=True)
 class RelaxMissionsReport(Report):
     """One report per mission, by the beginning of its id."""
 

@@ -49,7 +49,6 @@ def _optimize(
     )
 
 
-@dataclasses.dataclass(frozen=True)
 class WarmupReport(Report):
     """Number of kernels that are ready, and their folder."""
 

@@ -1,13 +1,11 @@
 """Commands that draw a map into a file: PNG, SVG or PDF."""
 
-import dataclasses
 from pathlib import Path
 
 from maplab_py.algorithms.evaluation.options import TrajectoryEvaluationOptions
 from maplab_py.plugin import CommandContext, Report, command
 
 
-@dataclasses.dataclass(frozen=True)
 class Plot(Report):
     """A figure that was written."""
 

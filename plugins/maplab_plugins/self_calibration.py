@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
     from maplab_py.online_calibration.suggestions import SuggestionReport
 
 
-@dataclasses.dataclass(frozen=True)
 class ExportedFiles(Report):
     """Files that were written."""
 

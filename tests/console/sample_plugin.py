@@ -54,7 +54,6 @@ class SolverOptions:
             raise ValueError("--ba_num_iterations cannot be negative")
 
 
-@dataclasses.dataclass(frozen=True)
 class SolveReport(Report):
     """What the pretended solver was told."""
 
@@ -111,7 +110,6 @@ def fail_after_commit(context: CommandContext, *, how: str = "user") -> Message:
     raise errors[how]
 
 
-@dataclasses.dataclass(frozen=True)
 class Refusal(Report):
     """A report of a failure."""
 

@@ -49,7 +49,6 @@ class AlignmentHypothesis:
     outcome: str  # wins, runner-up, loses, undecided
 
 
-@dataclasses.dataclass(frozen=True)
 class AnchoringReport(Report):
     """Anchored missions."""
 

@@ -1,6 +1,5 @@
 """Maps in cells: splitting, and joining of cells."""
 
-import dataclasses
 from collections.abc import Sequence
 from functools import reduce
 
@@ -118,7 +117,6 @@ def _cell(vi_map: VIMap, is_inside: Mask) -> VIMap:
 # earlier cell's. There the vertex was optimised with most of its surroundings.
 
 
-@dataclasses.dataclass(frozen=True)
 class JoinReport(Report):
     """Result of joining cells."""
 

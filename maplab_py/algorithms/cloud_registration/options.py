@@ -59,7 +59,6 @@ class CloudClosureOptions(Options, prefix="lidar_lc_"):
             raise FlagError("--lidar_lc_global and --lidar_lc_from_closures exclude each other")
 
 
-@dataclasses.dataclass(frozen=True)
 class CloudClosureReport(Report):
     """Counts of a search for loop closures between clouds."""
 

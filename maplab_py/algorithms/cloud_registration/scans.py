@@ -1,6 +1,5 @@
 """Scans of missions, and pairs of scans that may overlap."""
 
-import dataclasses
 import itertools
 from functools import lru_cache
 from pathlib import Path
@@ -24,7 +23,6 @@ _KEPT = 400
 """Number of prepared clouds in memory."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class Scans(Rows):
     """Clouds (N) of sensors, by mission and time; S is the sensor at the time of the cloud."""
 
@@ -121,7 +119,6 @@ class CloudReader:
         return prepare_cloud(points, self._voxel_size_m, name)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class CloudPairs(Rows):
     """Pairs (N) of clouds: the later one, or that of the later mission, is the query."""
 

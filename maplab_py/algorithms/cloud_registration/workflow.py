@@ -137,7 +137,6 @@ _ID_OF_CLOUDS = np.uint64(0x6C696461725F6C63)
 """Closures of clouds and of images between the same vertices have different ids."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class CloudMatches(Rows):
     """Registered pairs (N) of clouds."""
 

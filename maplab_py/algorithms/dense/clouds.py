@@ -1,6 +1,5 @@
 """Depth maps as point clouds, and clouds of a camera as depth maps."""
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,6 @@ from maplab_py.storage.resources.new import NewResources
 from maplab_py.vimap import ResourceOwner, VIMap, resources_of
 
 
-@dataclasses.dataclass(frozen=True)
 class ConvertedDepthMaps(Report):
     """Depth maps that became point clouds; they are written when the map is saved."""
 

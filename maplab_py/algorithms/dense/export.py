@@ -28,7 +28,6 @@ _SOURCES = 20
 _IMAGE_SUFFIXES = (".ppm", ".jpg")
 
 
-@dataclasses.dataclass(frozen=True)
 class MvsExport(Report):
     """Files written for multi-view stereo."""
 

@@ -209,7 +209,6 @@ class FieldReport:
     megabytes: float
 
 
-@dataclasses.dataclass(frozen=True)
 class FieldsReport(Report):
     """Euclidean signed distance fields; they are written when the map is saved."""
 

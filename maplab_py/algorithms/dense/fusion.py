@@ -53,7 +53,6 @@ class GridReport:
     )
 
 
-@dataclasses.dataclass(frozen=True)
 class FusionReport(Report):
     """Grids of truncated signed distances; they are written when the map is saved."""
 

@@ -1,6 +1,5 @@
 """The mesh of the grids of a map."""
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,6 @@ from maplab_py.sensors.projection import is_inside_image, project
 from maplab_py.vimap import ResourceOwner, VIMap, resources_of
 
 
-@dataclasses.dataclass(frozen=True)
 class MeshReport(Report):
     """A mesh that was written."""
 

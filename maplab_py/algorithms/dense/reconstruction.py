@@ -62,7 +62,6 @@ class PairReport:
     kept_share: float  # after that, without edges
 
 
-@dataclasses.dataclass(frozen=True)
 class StereoReport(Report):
     """Depth of stereo images; the files are written when the map is saved."""
 

@@ -43,7 +43,6 @@ class BaselineErrors:
     rpe_deg: float | None
 
 
-@dataclasses.dataclass(frozen=True)
 class TrajectoryEvaluationReport(Report):
     """Errors of the vertices against ground truth."""
 
@@ -147,7 +146,6 @@ class LocalizationErrors:
     median_step_m: float | None
 
 
-@dataclasses.dataclass(frozen=True)
 class LocalizationEvaluationReport(Report):
     """Errors of poses in a map."""
 
@@ -187,7 +185,6 @@ class Difference:
         return self.compared == 0
 
 
-@dataclasses.dataclass(frozen=True)
 class MapComparisonReport(Report):
     """Differences of two maps. `is_identical`: every number of every table and all sensors are equal."""
 

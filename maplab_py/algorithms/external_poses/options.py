@@ -153,7 +153,6 @@ def _numbers(flag: str, text: str, count: int) -> list[float]:
     return values
 
 
-@dataclasses.dataclass(frozen=True)
 class TrajectoryImport(Report):
     """Measurements, or a mission, that a trajectory became."""
 
@@ -185,7 +184,6 @@ class LeftOutFixes:
     count: int
 
 
-@dataclasses.dataclass(frozen=True)
 class GpsImport(Report):
     """Positions that became measurements of a mission."""
 
@@ -207,7 +205,6 @@ class GpsImport(Report):
         return "optvi --ba_include_absolute_pose_constraints uses them and leaves out outliers"
 
 
-@dataclasses.dataclass(frozen=True)
 class WheelImport(Report):
     """Wheel odometry that became edges of a mission."""
 

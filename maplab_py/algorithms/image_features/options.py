@@ -74,7 +74,6 @@ class FeatureTrackOptions(Options, prefix="track_"):
         return type_of_name(self.feature_type, "feature_type"), ()
 
 
-@dataclasses.dataclass(frozen=True)
 class ExtractionReport(Report):
     """Features that images gave."""
 
@@ -91,7 +90,6 @@ class ExtractionReport(Report):
     landmarks_removed: int = 0
 
 
-@dataclasses.dataclass(frozen=True)
 class FeatureTrackReport(Report):
     """Links of keypoints between frames."""
 

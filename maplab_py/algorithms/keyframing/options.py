@@ -1,7 +1,5 @@
 """Options and report of keyframing."""
 
-import dataclasses
-
 from maplab_py.options import Options, option
 from maplab_py.report import Report
 
@@ -19,7 +17,6 @@ class KeyframingOptions(Options, prefix="kf_"):
     """Make a keyframe where fewer landmarks are shared with the last one."""
 
 
-@dataclasses.dataclass(frozen=True)
 class KeyframingReport(Report):
     """Keyframes by the first reason that applied, and data removed with other vertices."""
 

@@ -4,7 +4,6 @@ It is stored in a field of the landmark's message that other programs skip. Sess
 session places, not images: images of one place fail for the same reason.
 """
 
-import dataclasses
 from typing import Any
 
 import numpy as np
@@ -33,7 +32,6 @@ RECORD = np.dtype(
 NEVER = np.float32(-1e30)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class Session(Rows):
     """Outcome of one session for landmarks (N,)."""
 

@@ -1,7 +1,5 @@
 """Options of the landmark algorithms; maplab's names and defaults."""
 
-import dataclasses
-
 from maplab_py.errors import FlagError
 from maplab_py.options import Options, option
 from maplab_py.report import Report
@@ -63,7 +61,6 @@ _FLAGS = {
 }
 
 
-@dataclasses.dataclass(frozen=True)
 class LandmarkQualityReport(Report):
     """Verdicts on the landmarks of the chosen missions."""
 
@@ -96,7 +93,6 @@ class LandmarkQualityReport(Report):
         )
 
 
-@dataclasses.dataclass(frozen=True)
 class RetriangulationReport(Report):
     """Number of landmarks with a new position."""
 
@@ -109,7 +105,6 @@ class RetriangulationReport(Report):
     quality: LandmarkQualityReport
 
 
-@dataclasses.dataclass(frozen=True)
 class TrackReport(Report):
     """New landmarks from feature tracks."""
 
@@ -120,7 +115,6 @@ class TrackReport(Report):
     retriangulation: RetriangulationReport | None
 
 
-@dataclasses.dataclass(frozen=True)
 class LandmarkRemovalReport(Report):
     """Removed landmarks."""
 
@@ -130,7 +124,6 @@ class LandmarkRemovalReport(Report):
     unknown_left: int
 
 
-@dataclasses.dataclass(frozen=True)
 class InvalidObservationReport(Report):
     """Detached observations, by the first reason that applied."""
 

@@ -267,7 +267,6 @@ class Criterion:
     flag: str
 
 
-@dataclasses.dataclass(frozen=True)
 class LandmarkExplanation(Report):
     """The criteria of a landmark's quality."""
 

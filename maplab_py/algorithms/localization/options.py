@@ -55,7 +55,6 @@ class Distribution:
     largest: float
 
 
-@dataclasses.dataclass(frozen=True)
 class LocalizationReport(Report):
     """Number, accuracy and run time of localised queries."""
 
@@ -98,7 +97,6 @@ class LocalizationReport(Report):
 QUERY_PATH = "the query's own path"
 
 
-@dataclasses.dataclass(frozen=True)
 class _DifferenceReport(LocalizationReport):
     """Result compared with the query's own path, which has errors too."""
 

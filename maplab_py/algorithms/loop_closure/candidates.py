@@ -7,7 +7,6 @@ Places of each mission are verified separately because only a single mission is 
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from typing import Any
 
@@ -37,7 +36,6 @@ _PART_BYTES = 5e7
 """Memory of the landmarks and matches of the places that are looked at together."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class Matches(Rows):
     """Matches of query features with database features (rows of `MapFeatures`)."""
 
@@ -46,7 +44,6 @@ class Matches(Rows):
     bits: I32  # (M,) different bits, or squared distance of descriptors that are not binary
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class Candidates(Groups, items=("match",)):
     """Pairs of a query vertex and a place, with the matches between them."""
 
@@ -56,7 +53,6 @@ class Candidates(Groups, items=("match",)):
     match: I64  # rows of `Matches`, by candidate
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class _MatchesByVertex(Groups, items=("row", "landmark")):
     """Matches ordered by their query vertex (V of them)."""
 

@@ -32,7 +32,6 @@ USES = ("", "merge", "edge", "relax", "anchor")
 """Use of a closure; codes of the `use` column are indices into this tuple."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class ClosureRecord(Table):
     """Closures, accepted and refused, one row each. A is the query vertex, B the place's vertex."""
 
@@ -61,7 +60,6 @@ class ClosureRecord(Table):
     difference: NDArray[np.float32] = column(np.float32, fill=np.nan)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class MergedLandmarks(Table):
     """Landmarks removed by merges, with their state before."""
 
@@ -72,7 +70,6 @@ class MergedLandmarks(Table):
     feature_type: NDArray[np.int32] = column(np.int32)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class MergedKeypoints(Table):
     """Keypoints whose landmark changed, with their original landmark."""
 
@@ -81,7 +78,6 @@ class MergedKeypoints(Table):
     landmark: NDArray[np.uint64] = column(np.uint64, 2)  # id
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class MergePairs(Table):
     """Closures (by id) that support the merge of two landmarks; one row per closure and pair."""
 

@@ -45,7 +45,6 @@ class GateValues:
         return np.asarray(self.verdict == VERDICTS.index(Verdict.ACCEPTED))
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class Closures(GateValues, Groups, items=("keypoint", "landmark", "bits")):
     """Poses of query vertices relative to places; M is the mission frame of the place."""
 

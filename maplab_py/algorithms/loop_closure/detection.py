@@ -186,7 +186,6 @@ _MATCHES_AT_ONCE = 400_000
 """Matches whose rays and points are in memory together, about 200 bytes each."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class PoseSearch(PoseSolutions, Groups, items=("is_inlier", "feature", "landmark", "bits")):
     """Estimated poses of candidates (P,), and the inliers (N,) of each."""
 

@@ -36,7 +36,6 @@ class GateLine:
     flag: str  # moves the threshold
 
 
-@dataclasses.dataclass(frozen=True)
 class ClosureExplanation(Report):
     """Gates of one closure."""
 
@@ -73,7 +72,6 @@ class NearMiss:
     shortfall: float  # relative to the thresholds, summed over the gates
 
 
-@dataclasses.dataclass(frozen=True)
 class PairExplanation(Report):
     """Gates that the closures between two missions fail."""
 
@@ -85,7 +83,6 @@ class PairExplanation(Report):
     summary: str = dataclasses.field(metadata={"is_prose": True})
 
 
-@dataclasses.dataclass(frozen=True)
 class MissionExplanation(Report):
     """Whether the base frame of a mission is known, and its closures with every other mission."""
 

@@ -34,7 +34,6 @@ _DESCRIPTORS = 16
 """Observations of a landmark whose descriptors are compared."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class LandmarkMatches(Rows):
     """Keypoints of queries matched with landmarks (N,)."""
 

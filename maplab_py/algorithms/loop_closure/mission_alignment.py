@@ -30,7 +30,6 @@ _DRIFT_OFFSET_M, _DRIFT_RATIO = 0.5, 0.02
 _MAX_TURN_RAD = 0.3
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class PairedClosures(Rows):
     """Closures (N,) between missions; A is the mission with the smaller row."""
 
@@ -75,7 +74,6 @@ def ordered_by_mission(
     return columns
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class LocatedClosures(PairedClosures):
     """Closures (N,) between missions with the places of their ends along the trajectories."""
 

@@ -36,7 +36,6 @@ UNKNOWN_BASE_FRAME = "between missions without known base frames: anchor first"
 """Reasons for which landmarks are not merged."""
 
 
-@dataclasses.dataclass(frozen=True)
 class LoopClosureReport(Report):
     """Counts of a search and the use of its result."""
 
@@ -113,7 +112,6 @@ class ClosureLine:
     weight: float  # weight after relaxation, 1 = full
 
 
-@dataclasses.dataclass(frozen=True)
 class ClosureReport(Report):
     """The recorded closures of a map."""
 
@@ -142,7 +140,6 @@ class ClosureReport(Report):
         return view({"closures": ""}, closures=lines, summary=summary, notes=self.notes)
 
 
-@dataclasses.dataclass(frozen=True)
 class ClosureRemovalReport(Report):
     """Entities removed and restored with closures."""
 
@@ -153,7 +150,6 @@ class ClosureRemovalReport(Report):
     notes: tuple[str, ...] = ()
 
 
-@dataclasses.dataclass(frozen=True)
 class ClosureVerdictReport(Report):
     """Verdicts that a person has given."""
 
@@ -171,7 +167,6 @@ class ClosureVerdictReport(Report):
         return "relax moves the trajectory by these closures" if self.edges_added else ""
 
 
-@dataclasses.dataclass(frozen=True)
 class TrainingReport(Report):
     """Training data of a projection and its separation of landmarks."""
 

@@ -29,7 +29,6 @@ class UpdateOptions(Options, prefix=""):
     """Number of vertices that a landmark should keep as observers when vertices are removed"""
 
 
-@dataclasses.dataclass(frozen=True)
 class EvidenceReport(Report):
     """Outcome of one session for the landmarks of others."""
 
@@ -60,7 +59,6 @@ class Change:
     view_after: str
 
 
-@dataclasses.dataclass(frozen=True)
 class ChangeReport(Report):
     """Regions that changed between the earlier and the later sessions."""
 
@@ -72,7 +70,6 @@ class ChangeReport(Report):
     note: str = ""
 
 
-@dataclasses.dataclass(frozen=True)
 class GatheringReport(Report):
     """Evidence of the sessions of a map, and how probable it is that landmarks exist."""
 
@@ -89,7 +86,6 @@ class GatheringReport(Report):
     note: str = ""
 
 
-@dataclasses.dataclass(frozen=True)
 class MapUpdateReport(Report):
     """Contents of the map before and after an update."""
 
@@ -138,7 +134,6 @@ class UpdateRecord:
         return cls(date=newest.date, session=newest.session, **values)
 
 
-@dataclasses.dataclass(frozen=True)
 class ChronicleReport(Report):
     """Updates of a map, the oldest first."""
 

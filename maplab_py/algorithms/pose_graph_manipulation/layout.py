@@ -1,7 +1,5 @@
 """Spread missions with unknown base frame in space for visualisation."""
 
-import dataclasses
-
 import numpy as np
 
 from maplab_py.array_types import I64
@@ -60,7 +58,6 @@ class DisturbanceOptions(Options, prefix="disturb_"):
     """Seed of the disturbance."""
 
 
-@dataclasses.dataclass(frozen=True)
 class DisturbanceReport(Report):
     """Magnitude of the applied disturbance."""
 

@@ -82,7 +82,6 @@ def cause(findings: Sequence[Finding]) -> Finding | None:
     return next((f for f in findings if worst and _WEIGHT[f.verdict] == worst), None)
 
 
-@dataclasses.dataclass(frozen=True)
 class RecordingCheck(Report):
     """Findings on a recording, causes before effects."""
 

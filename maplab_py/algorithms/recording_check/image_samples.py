@@ -39,7 +39,6 @@ class ImageFigures:
     is_repeated: bool  # the same pixels as the image before
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class PointPairs(Rows):
     """Points of one camera in P pairs of images; rows are padded to the same length."""
 

@@ -23,7 +23,6 @@ _REPEAT_EVERY = 5
 """After so many sampled images the next one is compared with the one before."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class ImuSignal(Rows):
     """All samples of the IMU."""
 

@@ -29,7 +29,6 @@ _LEAST_SINE = 0.05
 _DAMPING = 1e-6
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class RayPairs(Rows):
     """Unit rays of the points of P pairs of images, and the times of the images."""
 

@@ -53,7 +53,6 @@ class SwitchedOff:
     error_deg: float
 
 
-@dataclasses.dataclass(frozen=True)
 class RelaxationReport(Report):
     """Result of a relaxation."""
 

@@ -19,7 +19,6 @@ class ParameterEstimate:
     verdict: str
 
 
-@dataclasses.dataclass(frozen=True)
 class SelfCalibrationReport(Report):
     """Result of a calibration and its uncertainty."""
 
@@ -68,7 +67,6 @@ class KeptSegment:
     unobservable: int
 
 
-@dataclasses.dataclass(frozen=True)
 class CollectionReport(Report):
     """Segments that were evaluated, and the database afterwards."""
 
@@ -104,7 +102,6 @@ class ParameterReference:
     sigma: float
 
 
-@dataclasses.dataclass(frozen=True)
 class InformationReport(Report):
     """Information of all segments."""
 
@@ -125,7 +122,6 @@ class ComparedParameter:
     difference: float
 
 
-@dataclasses.dataclass(frozen=True)
 class CalibrationComparison(Report):
     """Differences between two calibrations."""
 
@@ -154,7 +150,6 @@ class DatabaseParameter:
     best_sigma: float  # given the best segment
 
 
-@dataclasses.dataclass(frozen=True)
 class DatabaseReport(Report):
     """Contents of a segment database."""
 
@@ -183,7 +178,6 @@ class PrunedSegment:
     outdated: bool
 
 
-@dataclasses.dataclass(frozen=True)
 class PruneReport(Report):
     """Removal of segments from a database."""
 

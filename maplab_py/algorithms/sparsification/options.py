@@ -54,7 +54,6 @@ class KeyframeCoverage:
     after: int
 
 
-@dataclasses.dataclass(frozen=True)
 class SparsificationReport(Report):
     """Remaining landmarks and coverage of the keyframes."""
 

@@ -29,7 +29,6 @@ class QuantityLine:
     largest: float
 
 
-@dataclasses.dataclass(frozen=True)
 class MapDistributions(Report):
     """Order statistics of the quantities that distinguish good maps from bad ones."""
 
@@ -129,7 +128,6 @@ class Saving:
     what: str = dataclasses.field(metadata={"title": "result"})
 
 
-@dataclasses.dataclass(frozen=True)
 class MapSize(Report):
     """Size of a map in memory and on disk, and possible savings."""
 

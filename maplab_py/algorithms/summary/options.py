@@ -24,7 +24,6 @@ class SummaryMapOptions(Options, prefix="summary_map_"):
     written in any case."""
 
 
-@dataclasses.dataclass(frozen=True)
 class SummaryMapReport(Report):
     """Content of a written summary map."""
 
@@ -36,7 +35,6 @@ class SummaryMapReport(Report):
     file: Path
 
 
-@dataclasses.dataclass(frozen=True)
 class SummaryMapContent(Report):
     """Content of a loaded summary map."""
 
@@ -64,7 +62,6 @@ class WorkflowStep:
     note: str
 
 
-@dataclasses.dataclass(frozen=True)
 class WorkflowReport(Report):
     """All steps of the workflow that makes a localisation map."""
 

@@ -40,7 +40,6 @@ class CalibratedParameter:
     sigma: float
 
 
-@dataclasses.dataclass(frozen=True)
 class VIOptimizationReport(Report):
     """Result of a batch optimisation.
 

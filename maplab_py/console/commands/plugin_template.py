@@ -33,16 +33,13 @@ packages = ["$package"]
 _MODULE = '''\
 """Commands of the plugin $name."""
 
-import dataclasses
-
 import numpy as np
 
 from maplab_py.plugin import CommandContext, Report, UserError, command
 
 
-@dataclasses.dataclass(frozen=True)
 class PathLengths(Report):
-    """What the command found; printed as a table, or as JSON with --json."""
+    """Result of the command: printed as a table, or as JSON with --json."""
 
     missions: int
     longest_m: float

@@ -50,7 +50,6 @@ class Step:
     runs: int  # on which the prediction rests
 
 
-@dataclasses.dataclass(frozen=True)
 class Plan(Report):
     """The steps of a script that has no fault, and what they take."""
 

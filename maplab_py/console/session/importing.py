@@ -28,7 +28,6 @@ _MAP_KEY = Flag(
 ReaderT = TypeVar("ReaderT", bound="Callable[..., VIMap]")
 
 
-@dataclasses.dataclass(frozen=True)
 class ImportedMap(Report):
     """The map that was read."""
 

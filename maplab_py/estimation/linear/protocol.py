@@ -1,7 +1,5 @@
 """Size of factors, and the error of matrices that have none."""
 
-import dataclasses
-
 from maplab_py.errors import EstimationError
 from maplab_py.report import Report
 
@@ -14,7 +12,6 @@ class NotPositiveDefinite(EstimationError):
         self.node = node
 
 
-@dataclasses.dataclass(frozen=True)
 class FactorStatistics(Report):
     """Size and cost of a factorisation."""
 

@@ -32,7 +32,6 @@ class EdgeColumns(NamedTuple):
     sqrt_information: F64  # (E, 6, 6)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class RelativePoses(Rows):
     """Measured relative poses between vertices (E edges), all with the same kind of residual e."""
 

@@ -83,7 +83,6 @@ class FrameRows:
             setattr(self, field.name, np.delete(getattr(self, field.name), frame, axis=0))
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class StartState(NavState):
     """State of the first frame (N = 1). M has gravity along -z."""
 

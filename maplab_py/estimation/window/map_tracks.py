@@ -11,7 +11,6 @@ from maplab_py.estimation.window.map_terms import MapObservations
 from maplab_py.estimation.window.tracks import Tracks
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class MapMatches(Rows):
     """M tracks that each observe a landmark of the map; no track and no landmark occurs twice."""
 

@@ -18,7 +18,6 @@ _COLUMNS = (
 )  # fmt: skip
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class Observations(Rows):
     """O observations in the order of time."""
 

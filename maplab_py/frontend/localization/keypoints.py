@@ -1,6 +1,5 @@
 """Keypoints of a frame that are matched with a map."""
 
-import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,7 +14,6 @@ from maplab_py.interop.recordings.protocol import RecordedSensors, TrackedFrame
 from maplab_py.vimap.descriptors import FeatureType
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class FrameKeypoints(Rows):
     """N keypoints with descriptors of all cameras of one frame."""
 

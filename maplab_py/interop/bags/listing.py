@@ -33,7 +33,6 @@ class BagImages:
     encoding: str  # or format, of the first image
 
 
-@dataclasses.dataclass(frozen=True)
 class BagInfo(Report):
     """Content of a bag."""
 

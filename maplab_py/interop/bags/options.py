@@ -88,7 +88,6 @@ class WrittenTopic:
     messages: int
 
 
-@dataclasses.dataclass(frozen=True)
 class BagReport(Report):
     """A bag that was written."""
 
@@ -106,7 +105,6 @@ def written_topics(counts: Mapping[str, int]) -> tuple[WrittenTopic, ...]:
     return tuple(WrittenTopic(topic, count) for topic, count in sorted(counts.items()))
 
 
-@dataclasses.dataclass(frozen=True)
 class BagImport(Report):
     """Messages that became resources of a mission; their files are written when the map is saved."""
 

@@ -1,6 +1,5 @@
 """Options and reports of the exchange with COLMAP."""
 
-import dataclasses
 from pathlib import Path
 
 from maplab_py.interop.stamps import time_unit_option
@@ -29,7 +28,6 @@ class ColmapExportOptions(Options):
     """Write the positions of the cameras to database.db as priors"""
 
 
-@dataclasses.dataclass(frozen=True)
 class ColmapExportReport(Report):
     """Written files."""
 
@@ -77,7 +75,6 @@ class ColmapImportOptions(Options):
     """Standard deviation of the rotation of odometry edges"""
 
 
-@dataclasses.dataclass(frozen=True)
 class ColmapImportReport(Report):
     """Result of an import; the map is marked where scale or gravity are unknown."""
 

@@ -44,7 +44,6 @@ class RecordedTopic:
     messages: int
 
 
-@dataclasses.dataclass(frozen=True)
 class RecordedBag(Report):
     """Result of a recording."""
 

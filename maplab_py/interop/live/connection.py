@@ -67,7 +67,6 @@ class LiveTopic:
     reliable: bool
 
 
-@dataclasses.dataclass(frozen=True)
 class LiveTopics(Report):
     """Topics that running robots publish."""
 

@@ -42,7 +42,6 @@ class PlayedTopic:
     subscribers: int
 
 
-@dataclasses.dataclass(frozen=True)
 class PlayedRecording(Report):
     """Published messages."""
 

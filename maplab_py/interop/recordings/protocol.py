@@ -17,7 +17,6 @@ from maplab_py.sensors import Imu
 from maplab_py.vimap.descriptors import DescriptorDepth, FeatureType
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class ImuBatch(Rows):
     """Consecutive IMU samples, at least one, in the order of time."""
 

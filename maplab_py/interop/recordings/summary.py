@@ -47,7 +47,6 @@ class CameraSummary:
     unmatched_images: int  # without partners in the other cameras
 
 
-@dataclasses.dataclass(frozen=True)
 class RecordingReport(Report):
     """Content of a recording."""
 

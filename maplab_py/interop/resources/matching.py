@@ -102,7 +102,6 @@ def stamped_files(folder: Path, suffixes: tuple[str, ...], flag: str) -> tuple[I
     return times, files
 
 
-@dataclasses.dataclass(frozen=True)
 class ImportedResources(Report):
     """Files that became resources of a mission; they are written when the map is saved."""
 
@@ -117,7 +116,6 @@ class ImportedResources(Report):
     notes: tuple[str, ...] = ()
 
 
-@dataclasses.dataclass(frozen=True)
 class ExportedImages(Report):
     """Images that were written as an EuRoC folder."""
 

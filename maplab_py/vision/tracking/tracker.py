@@ -420,7 +420,6 @@ def match(
     return StereoMatches(uv, tracks.track_id[rows], tracks.num_frames[rows], distance_m)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class LiveTracks(Rows):
     """Tracks at the latest image of a camera."""
 

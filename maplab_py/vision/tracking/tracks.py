@@ -9,7 +9,6 @@ import numpy as np
 from maplab_py.array_types import F64, I64, Rows
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class CameraTracks(Rows):
     """Tracked keypoints of one camera of a frame set."""
 

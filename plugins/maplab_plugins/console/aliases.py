@@ -14,7 +14,6 @@ class AliasLine:
     stands_for: str
 
 
-@dataclasses.dataclass(frozen=True)
 class AliasList(Report):
     """The aliases of the session."""
 
@@ -100,7 +99,6 @@ class SettingLine:
     commands: str
 
 
-@dataclasses.dataclass(frozen=True)
 class SettingList(Report):
     """Flags with their values."""
 

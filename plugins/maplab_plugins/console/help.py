@@ -45,7 +45,6 @@ TASKS = (
 )
 
 
-@dataclasses.dataclass(frozen=True)
 class CommandIndex(Report):
     """Common tasks, and commands by plugin."""
 
@@ -62,7 +61,6 @@ class MatchLine:
     help: str
 
 
-@dataclasses.dataclass(frozen=True)
 class MatchingCommands(Report):
     """Commands whose names, flags or help have the words of a search; the best first."""
 
@@ -80,7 +78,6 @@ class FlagLine:
     help: str
 
 
-@dataclasses.dataclass(frozen=True)
 class CommandPage(Report):
     """The help page of one command."""
 
@@ -95,7 +92,6 @@ class CommandPage(Report):
     flags: tuple[FlagLine, ...] = dataclasses.field(metadata={"are_entries": True})
 
 
-@dataclasses.dataclass(frozen=True)
 class CommandPages(Report):
     """The help pages of several commands, each with its one-line usage."""
 
@@ -113,7 +109,6 @@ class PluginLine:
     problem: str
 
 
-@dataclasses.dataclass(frozen=True)
 class PluginList(Report):
     """All plugins; those that failed to load with the reason."""
 
@@ -259,7 +254,6 @@ def list_plugins(context: CommandContext) -> PluginList:
     return PluginList(lines, clashes)
 
 
-@dataclasses.dataclass(frozen=True)
 class SchemaReport(Report):
     """A JSON schema."""
 

@@ -24,14 +24,12 @@ class JobLine:
     problem: str
 
 
-@dataclasses.dataclass(frozen=True)
 class JobList(Report):
     """The background commands of the session."""
 
     jobs: tuple[JobLine, ...]
 
 
-@dataclasses.dataclass(frozen=True)
 class JoinReport(Report):
     """Finished background commands, their reports, and the keys of their results."""
 

@@ -29,7 +29,6 @@ class TimingLine:
     longest_s: float
 
 
-@dataclasses.dataclass(frozen=True)
 class TimingTable(Report):
     """Time spent in the commands of this session, longest first."""
 
@@ -174,7 +173,6 @@ def enable_sheep(context: CommandContext) -> Message:
     return Message("baa")
 
 
-@dataclasses.dataclass(frozen=True)
 class NewPlugin(Report):
     """Files of the new package, and the next steps."""
 

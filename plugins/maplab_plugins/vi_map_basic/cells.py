@@ -22,7 +22,6 @@ class CellLine:
     landmarks: int
 
 
-@dataclasses.dataclass(frozen=True)
 class SplitReport(Report):
     """The cells of a map, each a new map in memory."""
 

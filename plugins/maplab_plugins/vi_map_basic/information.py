@@ -41,7 +41,6 @@ class BaseFrameLine:
     yaw_deg: float
 
 
-@dataclasses.dataclass(frozen=True)
 class BaseFrameList(Report):
     """The base frames of all missions."""
 
@@ -63,7 +62,6 @@ class CameraLine:
     q_B_C_xyzw: NDArray[np.float64]
 
 
-@dataclasses.dataclass(frozen=True)
 class CameraList(Report):
     """The calibrations of all cameras."""
 
@@ -214,7 +212,6 @@ class MapMemory:
     dropped_values: int  # that undo cannot restore any more
 
 
-@dataclasses.dataclass(frozen=True)
 class MemoryReport(Report):
     """Memory of the maps, the cache of maps and the process."""
 

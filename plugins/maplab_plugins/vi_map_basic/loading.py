@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from maplab_py.vimap import VIMap
 
 
-@dataclasses.dataclass(frozen=True)
 class FolderList(Report):
     """Map folders below a folder."""
 
@@ -35,7 +34,6 @@ class LoadedMap:
     folder: Path
 
 
-@dataclasses.dataclass(frozen=True)
 class LoadedMaps(Report):
     """Loaded maps, each under its key."""
 
@@ -57,7 +55,6 @@ class LoadedMaps(Report):
         return Message("\n".join((sentence, *notes)))
 
 
-@dataclasses.dataclass(frozen=True)
 class MergedMaps(Report):
     """Maps loaded and merged into one."""
 

@@ -26,7 +26,6 @@ class MapLine:
     folder: Path | None
 
 
-@dataclasses.dataclass(frozen=True)
 class MapList(Report):
     """All maps in memory."""
 
@@ -202,14 +201,12 @@ class HistoryLine:
     state: str
 
 
-@dataclasses.dataclass(frozen=True)
 class MapHistory(Report):
     """The commands that led to the present value of a map, then the undone ones."""
 
     commands: tuple[HistoryLine, ...] = dataclasses.field(metadata={"title": ""})
 
 
-@dataclasses.dataclass(frozen=True)
 class MapScript(Report):
     """The commands that lead to the present value of a map, in a new session."""
 

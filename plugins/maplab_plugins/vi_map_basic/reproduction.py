@@ -25,7 +25,6 @@ class CardFact:
     now: str
 
 
-@dataclasses.dataclass(frozen=True)
 class Reproduction(Report):
     """A map that was made again, compared with its card and with the map beside that."""
 

@@ -32,7 +32,6 @@ class ResourceFolderLine:
     is_used_for_new: bool
 
 
-@dataclasses.dataclass(frozen=True)
 class ResourceFolderList(Report):
     """The map's resource folders."""
 
@@ -48,7 +47,6 @@ class ResourceCount:
     resources: int
 
 
-@dataclasses.dataclass(frozen=True)
 class ResourceStatistics(Report):
     """Number of resources by type."""
 
@@ -66,14 +64,12 @@ class CacheLine:
     megabytes: float
 
 
-@dataclasses.dataclass(frozen=True)
 class CacheReport(Report):
     """Use of the cache of resources since the program started."""
 
     types: tuple[CacheLine, ...]
 
 
-@dataclasses.dataclass(frozen=True)
 class CleanUpReport(Report):
     """Resource folders that were merged, and files that no resource refers to."""
 

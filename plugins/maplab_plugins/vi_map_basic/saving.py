@@ -22,7 +22,6 @@ class SavedMap:
     folder: Path
 
 
-@dataclasses.dataclass(frozen=True)
 class SavedMaps(Report):
     """The saved maps, the reports of the writer, and problems."""
 
@@ -59,7 +58,6 @@ class PlannedSave:
     resource_files_to_delete: int
 
 
-@dataclasses.dataclass(frozen=True)
 class SavePlan(Report):
     """Planned effect of saving; nothing has been written."""
 

@@ -52,7 +52,6 @@ class LayerLine:
     visible: bool
 
 
-@dataclasses.dataclass(frozen=True)
 class ViewReport(Report):
     """Shown page and its address."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,7 +18,6 @@ if TYPE_CHECKING:
     from maplab_py.vimap import VIMap
 
 
-@dataclasses.dataclass(frozen=True)
 class DifferenceReport(Report):
     """Distances of vertices between two states."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
     from maplab_py.viewer.display.viewer import Viewer
 
 
-@dataclasses.dataclass(frozen=True)
 class SavedPicture(Report):
     """A picture that was saved."""
 
@@ -31,7 +29,6 @@ class SavedPicture(Report):
     taken_by: str
 
 
-@dataclasses.dataclass(frozen=True)
 class ExportedView(Report):
     """A page that was written."""
 

@@ -29,7 +29,6 @@ from tests.plugins.test_loopclosure import TWICE, session_of
 from tests.support.stereo_room import StereoRoom, quarter_size
 
 
-@dataclasses.dataclass(frozen=True)
 class Advised(Report):
     value: int = 1
 

@@ -93,7 +93,6 @@ class Row:
     note: str
 
 
-@dataclasses.dataclass(frozen=True)
 class Sample(Report):
     T_G_M_known: bool = True
     p_G_z_m: float = 1.0
@@ -135,7 +134,6 @@ class FlagLine:
     help: str
 
 
-@dataclasses.dataclass(frozen=True)
 class Page(Report):
     command: str
     flags: tuple[FlagLine, ...] = dataclasses.field(metadata={"are_entries": True})
@@ -195,7 +193,6 @@ def test_colours_do_not_change_the_layout() -> None:
         assert coloured == shown(PAGE, width)
 
 
-@dataclasses.dataclass(frozen=True)
 class Joined(Report):
     mission: str
     pairs: tuple[str, ...]
@@ -216,7 +213,6 @@ def test_missions_are_shown_by_name_wherever_their_id_stands() -> None:
     assert text_with_names("x61dc0de3 61dc0de", names) == "x61dc0de3 61dc0de"
 
 
-@dataclasses.dataclass(frozen=True)
 class Identified(Report):
     id: str
     mission: str
@@ -237,7 +233,6 @@ def test_a_short_id_of_two_missions_stays() -> None:
     assert text_with_names(IDS[0], names) == "monday"
 
 
-@dataclasses.dataclass(frozen=True)
 class Short(Report):
     count: int
 
@@ -250,12 +245,10 @@ def test_what_is_displayed_can_be_a_sentence_and_json_has_the_fields() -> None:
     assert Short(2).as_dict() == {"count": 2}
 
 
-@dataclasses.dataclass(frozen=True)
 class Untitled(Report):
     flags: tuple[FlagLine, ...] = dataclasses.field(metadata={"title": ""})
 
 
-@dataclasses.dataclass(frozen=True)
 class Several(Report):
     reports: dict[str, Report]
 
@@ -276,7 +269,6 @@ class Spread:
         return self.count == 0
 
 
-@dataclasses.dataclass(frozen=True)
 class Spreads(Report):
     queries: int
     position_m: Spread
@@ -304,7 +296,6 @@ def test_a_table_of_empty_records_is_left_out() -> None:
     assert shown(Spreads(7, nothing, nothing, nothing), 80) == "queries  7"
 
 
-@dataclasses.dataclass(frozen=True)
 class Script(Report):
     line: str
 
@@ -346,7 +337,6 @@ class Measured:
     ratio: float = dataclasses.field(metadata={"deviation": 1.0})
 
 
-@dataclasses.dataclass(frozen=True)
 class Measurements(Report):
     values: tuple[Measured, ...]
 
@@ -376,3 +366,15 @@ def test_ids_become_links_to_the_page_of_the_viewer() -> None:
         "http://127.0.0.1:8080/go/a243b811",
         "http://127.0.0.1:8080/go/deadbeef",
     ]
+
+
+def test_decorated_reports_of_plugins_are_the_same_dataclasses() -> None:
+    @dataclasses.dataclass(frozen=True)
+    class Decorated(Report):
+        count: int
+        note: str = "none"
+
+    assert Decorated(3).as_dict() == {"count": 3, "note": "none"}
+    assert Decorated(3) == Decorated(3, "none")
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        Decorated(3).count = 4  # type: ignore[misc]

@@ -33,7 +33,6 @@ class FarLandmarkOptions(Options, prefix="far_"):
     """Landmarks beyond this are far."""
 
 
-@dataclasses.dataclass(frozen=True)
 class FarLandmarks(Report):
     """A report: its fields are printed as a table, or as JSON with --json."""
 

@@ -54,7 +54,6 @@ class InstalledNetwork:
     file: Path
 
 
-@dataclasses.dataclass(frozen=True)
 class InstalledFeatures(Report):
     """The networks that were installed."""
 
