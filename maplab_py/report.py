@@ -27,6 +27,17 @@ class Report:
 
     def __init_subclass__(cls) -> None:
         dataclasses.dataclass(frozen=True)(cls)
+        # plugins may decorate their reports, too: the decorator must not see that this was done
+        del cls.__setattr__, cls.__delattr__
+        for field in dataclasses.fields(cls):
+            if field.default_factory is not dataclasses.MISSING:
+                setattr(cls, field.name, field)
+
+    def __setattr__(self, name: str, value: object) -> None:
+        raise dataclasses.FrozenInstanceError(f"cannot assign to field {name!r}")
+
+    def __delattr__(self, name: str) -> None:
+        raise dataclasses.FrozenInstanceError(f"cannot delete field {name!r}")
 
     @property
     def failure(self) -> str:

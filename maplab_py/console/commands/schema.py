@@ -105,6 +105,8 @@ def _schema(hint: Any, definitions: dict[str, Any]) -> dict[str, Any]:
 def _class_schema(
     kind: type, arguments: tuple[Any, ...], definitions: dict[str, Any]
 ) -> dict[str, Any]:
+    if kind is Report:
+        return {"type": "object"}
     if dataclasses.is_dataclass(kind):
         return _record_schema(kind, definitions)
     if issubclass(kind, np.ndarray):
@@ -125,8 +127,6 @@ def _class_schema(
 
 
 def _record_schema(kind: type, definitions: dict[str, Any]) -> dict[str, Any]:
-    if kind is Report:
-        return {"type": "object"}
     name = kind.__name__
     taken = definitions.get(name)
     if taken is not None and taken["$comment"] != kind.__module__:

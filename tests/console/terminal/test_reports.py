@@ -373,8 +373,9 @@ def test_decorated_reports_of_plugins_are_the_same_dataclasses() -> None:
     class Decorated(Report):
         count: int
         note: str = "none"
+        rows: list[int] = dataclasses.field(default_factory=list)
 
-    assert Decorated(3).as_dict() == {"count": 3, "note": "none"}
-    assert Decorated(3) == Decorated(3, "none")
+    assert Decorated(3).as_dict() == {"count": 3, "note": "none", "rows": []}
+    assert Decorated(3) == Decorated(3, "none", [])
     with pytest.raises(dataclasses.FrozenInstanceError):
         Decorated(3).count = 4  # type: ignore[misc]
