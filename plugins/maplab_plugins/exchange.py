@@ -251,34 +251,12 @@ def _measurements(
     context: CommandContext, trajectory: Trajectory, options: poses.TrajectoryOptions, mission: int
 ) -> poses.TrajectoryImport:
     from maplab_py.algorithms.external_poses import trajectories
-    from maplab_py.vimap.queries import mission_labels
 
-    before = context.vi_map
-    moved_m, turned_deg = 0.0, 0.0
-    notes: list[str] = []
-    count = int(before.vertex_start[mission + 1] - before.vertex_start[mission])
-    if options.kind == "absolute":
-        after, missing, movement = trajectories.as_absolute_poses(
-            before, mission, trajectory, options
-        )
-        moved_m, turned_deg = movement
-        added = count - missing
-    else:
-        after, missing, notes = trajectories.as_odometry(before, mission, trajectory, options)
-        added = count - 1 - missing
-    notes.append(trajectories.clock_note(before, mission, trajectory, options))
-    context.commit(after)
-    return poses.TrajectoryImport(
-        file=Path(trajectory.source),
-        kind=options.kind,
-        mission=mission_labels(before)[mission],
-        poses_in_file=len(trajectory),
-        added=added,
-        without_pose=missing,
-        moved_m=moved_m,
-        turned_deg=turned_deg,
-        notes=tuple(note for note in notes if note),
-    )
+    is_absolute = options.kind == "absolute"
+    attach = trajectories.as_absolute_poses if is_absolute else trajectories.as_odometry
+    result, report = attach(context.vi_map, mission, trajectory, options)
+    context.commit(result)
+    return report
 
 
 def _new_mission(
@@ -325,22 +303,12 @@ def import_gps(
     """
     from maplab_py.algorithms.external_poses.gps import attach_fixes
     from maplab_py.interop.gps import read_fixes
-    from maplab_py.vimap.queries import mission_labels
 
     mission = context.mission_row(map_mission)
     track = read_fixes(gps_file, options.date, options.topic, options.time_unit)
-    result = attach_fixes(context.vi_map, mission, track, options)
-    context.commit(result.vi_map)
-    return poses.GpsImport(
-        gps_file,
-        mission_labels(result.vi_map)[mission],
-        len(track),
-        result.added,
-        tuple(poses.LeftOutFixes(reason, count) for reason, count in track.left_out),
-        *result.origin,
-        *result.movement,
-        result.median_error_m,
-    )
+    result, report = attach_fixes(context.vi_map, mission, track, options)
+    context.commit(result)
+    return report
 
 
 @command(
@@ -367,21 +335,11 @@ def import_wheel_odometry(
     """
     from maplab_py.algorithms.external_poses.wheels import attach_wheels
     from maplab_py.interop.wheel_odometry import read_wheel_odometry
-    from maplab_py.vimap.queries import mission_labels
 
     mission = context.mission_row(map_mission)
     track = read_wheel_odometry(wheel_file, options.time_unit)
     if track.note:
         context.terminal.note(track.note)
-    result = attach_wheels(context.vi_map, mission, track, options)
-    context.commit(result.vi_map)
-    return poses.WheelImport(
-        wheel_file,
-        track.kind,
-        mission_labels(result.vi_map)[mission],
-        result.sensor_id,
-        len(track),
-        result.added,
-        result.missing,
-        result.distance_ratio,
-    )
+    result, report = attach_wheels(context.vi_map, mission, track, options)
+    context.commit(result)
+    return report

@@ -176,12 +176,12 @@ def test_files_merging_and_keyframes_keep_wheels(session: Session, tmp_path: Pat
         sensors={**other.sensors.sensors, sensor_id: vi_map.sensors.sensors[sensor_id]},
         extrinsics={**other.sensors.extrinsics, sensor_id: Extrinsics(IMU_ID, T_I_S)},
     )
-    other = attach_wheels(
+    other, _ = attach_wheels(
         other.replace(sensors=other_sensors),
         0,
         read_wheel_odometry(shifted),
         WheelOptions(sensor_id=sensor_id),
-    ).vi_map
+    )
     merged = merge.merge_maps(scaled, other)[0]
     edges = wheel_edges(merged)
     assert len(edges) == 2 * (VERTICES - 1)
@@ -214,7 +214,7 @@ def test_relaxation_does_not_take_wheels_for_the_body(session: Session, tmp_path
     vi_map = vi_map.replace(missions=missions)
     track = read_wheel_odometry(write_poses(tmp_path / "w.csv", scale=1.1))
     options = WheelOptions(position_m=ARM, orientation_xyzw=FLAGS["wheel_orientation_xyzw"])
-    with_both = attach_wheels(vi_map, 0, track, options).vi_map
+    with_both, _ = attach_wheels(vi_map, 0, track, options)
     wanted, found = (trajectory_edges(m, RelaxationOptions()) for m in (vi_map, with_both))
     np.testing.assert_array_equal(found.T_A_B, wanted.T_A_B)
     np.testing.assert_array_equal(found.sqrt_information, wanted.sqrt_information)
@@ -239,12 +239,10 @@ def test_a_sensor_of_the_map_brings_mounting_and_covariance(tmp_path: Path) -> N
     )
     vi_map = vi_map.replace(sensors=sensors)
     track = read_wheel_odometry(write_poses(tmp_path / "w.csv", scale=1.1))
-    result = attach_wheels(vi_map, 0, track, WheelOptions(sensor_id=sensor_id))
-    np.testing.assert_array_equal(wheel_edges(result.vi_map).covariance[0], C)
-    assert result.distance_ratio == pytest.approx(1.0, abs=1e-6)
-    again = attach_wheels(
-        result.vi_map, 0, track, WheelOptions(sensor_id=sensor_id, replace=True)
-    ).vi_map
+    result, report = attach_wheels(vi_map, 0, track, WheelOptions(sensor_id=sensor_id))
+    np.testing.assert_array_equal(wheel_edges(result).covariance[0], C)
+    assert report.distance_ratio == pytest.approx(1.0, abs=1e-6)
+    again, _ = attach_wheels(result, 0, track, WheelOptions(sensor_id=sensor_id, replace=True))
     assert again.sensors.sensors[sensor_id] is vi_map.sensors.sensors[sensor_id]
     with pytest.raises(UserError, match="no WHEEL_ODOMETRY sensor"):
         attach_wheels(vi_map, 0, track, WheelOptions(sensor_id=IMU_ID))
@@ -303,8 +301,8 @@ def with_wheels(true: VIMap, scale: float, tmp_path: Path) -> tuple[VIMap, str]:
     options = WheelOptions(
         position_m=ARM, orientation_xyzw=FLAGS["wheel_orientation_xyzw"], position_sigma_m=1e-3
     )
-    result = attach_wheels(true, 0, read_wheel_odometry(path), options)
-    return result.vi_map, result.sensor_id
+    result, report = attach_wheels(true, 0, read_wheel_odometry(path), options)
+    return result, report.sensor_id
 
 
 @pytest.mark.parametrize("fix_extrinsics", [True, False])

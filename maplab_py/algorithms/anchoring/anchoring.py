@@ -66,7 +66,6 @@ def anchor_missions(
     closures are recorded in the map, unless they anchored no mission.
 
     Args:
-        options: When missions count as aligned.
         loop_options: How places are recognised.
         missions: Mission rows to anchor; None = all unknown ones. Others may serve as bridges.
         choice: An alignment that a person has chosen; `options.hypothesis` is one, too.

@@ -51,7 +51,6 @@ def align_pairs(
     Args:
         sightings: The accepted closures.
         undecided: Pairs whose closures support no unique alignment, with the reason.
-        options: When two missions count as aligned.
         wanted: The pairs to align; None = all.
     """
     rows = sightings.rows_of_pairs()

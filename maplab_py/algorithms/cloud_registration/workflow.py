@@ -48,8 +48,6 @@ def close_cloud_loops(
 
     Args:
         map_folder: Folder of the map, for its resources.
-        options: Candidates, registration and gates.
-        missions: Missions (rows); None = all.
 
     Raises:
         UserError: There are no clouds, or a library is missing.

@@ -40,8 +40,6 @@ def evaluate_trajectory(
     Args:
         vi_map: Map whose vertices have time stamps of the ground truth's clock.
         ground_truth: Poses in the order of time.
-        options: What to compare and how.
-        missions: Mission rows; None = all.
 
     Raises:
         EstimationError: Fewer than three vertices have ground truth, or they cannot be aligned.
@@ -104,7 +102,6 @@ def clock_hint(
     Args:
         rows: Vertices; of several missions the longest is compared.
         ground_truth: Poses or positions in the order of time.
-        options: What to compare and how.
     """
     if len(ground_truth) < _MIN_MATCHED or len(rows) < _MIN_MATCHED:
         return ""

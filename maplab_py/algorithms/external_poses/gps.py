@@ -4,19 +4,19 @@ Positions are stored as absolute poses whose orientation is the estimated one wi
 1000 rad: it weighs nothing, and the format needs no type of its own.
 """
 
-import dataclasses
+from pathlib import Path
 
 import numpy as np
 
 from maplab_py.algorithms.external_poses import alignment, trajectories
-from maplab_py.algorithms.external_poses.options import GpsOptions
+from maplab_py.algorithms.external_poses.options import GpsImport, GpsOptions, LeftOutFixes
 from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import interpolation, se3, so3
 from maplab_py.interop.gps import GpsTrack, east_north_up_m
 from maplab_py.sensors import OtherSensor
 from maplab_py.sensors.yaml_entry import Entry
-from maplab_py.vimap import AbsolutePoses, MissionSensor, VIMap
+from maplab_py.vimap import AbsolutePoses, MissionSensor, VIMap, mission_labels
 
 ORIGIN = "enu_origin"
 """Key of the origin in the sensor's entry of sensors.yaml."""
@@ -24,17 +24,6 @@ _ORIGIN_KEYS = ("latitude_deg", "longitude_deg", "altitude_m")
 
 Origin = tuple[float, float, float]
 """Latitude, longitude [deg] and ellipsoidal altitude [m] of the origin of G."""
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class AttachedFixes:
-    """A map with fixes, and how they fit."""
-
-    vi_map: VIMap
-    origin: Origin
-    added: int
-    movement: alignment.Movement
-    median_error_m: float  # between fixes and the aligned mission
 
 
 def origin_of(vi_map: VIMap) -> Origin | None:
@@ -59,7 +48,7 @@ def origin_of(vi_map: VIMap) -> Origin | None:
 
 def attach_fixes(
     vi_map: VIMap, mission: int, track: GpsTrack, options: GpsOptions
-) -> AttachedFixes:
+) -> tuple[VIMap, GpsImport]:
     """Attach positions to the nearest vertices of a mission (row) and move its base frame.
 
     A fix is moved to the time of its vertex by the estimated motion between the two.
@@ -106,8 +95,16 @@ def attach_fixes(
         covariance=np.tile(np.diag(_variance(options)), (len(fixes), 1, 1)),
     )
     table = AbsolutePoses.concatenate([vi_map.absolute_poses, added])
-    result = vi_map.replace(absolute_poses=table)
-    return AttachedFixes(result, origin, len(fixes), movement, float(np.median(error_m)))
+    return vi_map.replace(absolute_poses=table), GpsImport(
+        Path(track.source),
+        mission_labels(vi_map)[mission],
+        len(track),
+        len(fixes),
+        tuple(LeftOutFixes(reason, count) for reason, count in track.left_out),
+        *origin,
+        *movement,
+        float(np.median(error_m)),
+    )
 
 
 def _origin(vi_map: VIMap, before: Origin | None, track: GpsTrack, options: GpsOptions) -> Origin:

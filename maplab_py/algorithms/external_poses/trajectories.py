@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,14 +11,21 @@ import numpy as np
 from maplab_py.algorithms.evaluation import plausibility, trajectory_evaluation
 from maplab_py.algorithms.evaluation.options import TrajectoryEvaluationOptions
 from maplab_py.algorithms.external_poses import alignment
-from maplab_py.algorithms.external_poses.options import TrajectoryOptions
+from maplab_py.algorithms.external_poses.options import TrajectoryImport, TrajectoryOptions
 from maplab_py.array_types import F64, I64, U64, Mask
 from maplab_py.errors import EstimationError, MapError, UserError
 from maplab_py.geometry import se3
 from maplab_py.geometry.interpolation import interpolate_poses
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.sensors import Extrinsics, OtherSensor
-from maplab_py.vimap import MissionSensor, TransformationKind, VIMap, mission_sensor_id, tables
+from maplab_py.vimap import (
+    MissionSensor,
+    TransformationKind,
+    VIMap,
+    mission_labels,
+    mission_sensor_id,
+    tables,
+)
 from maplab_py.vimap.ids import from_hex, random_ids, to_hex
 
 _ALONG = "odometry of a trajectory"
@@ -34,13 +42,10 @@ def shifted(trajectory: Trajectory, time_offset_s: float) -> Trajectory:
 
 def as_absolute_poses(
     vi_map: VIMap, mission: int, trajectory: Trajectory, options: TrajectoryOptions
-) -> tuple[VIMap, int, alignment.Movement]:
+) -> tuple[VIMap, TrajectoryImport]:
     """Attach poses T_G_S to the vertices of a mission (row) that are nearest to them.
 
     A pose is interpolated to the time of its vertex.
-
-    Returns:
-        The map, the number of vertices of the mission without a pose, and the movement of the mission.
 
     Raises:
         UserError: Nothing of the trajectory is at the time of the mission, or the mission has absolute
@@ -48,6 +53,7 @@ def as_absolute_poses(
         EstimationError: The vertical of the trajectory is not that of the mission, or another order of the
             quaternions fits clearly better.
     """
+    before = vi_map
     vi_map = without_absolute_poses(vi_map, mission, trajectory.source, replace=options.replace)
     rows = np.arange(vi_map.vertex_start[mission], vi_map.vertex_start[mission + 1])
     stamps = vi_map.vertices.timestamp_ns[rows]
@@ -86,16 +92,35 @@ def as_absolute_poses(
         covariance=np.tile(np.diag(sigma**2), (len(rows), 1, 1)),
     )
     table = tables.AbsolutePoses.concatenate([vi_map.absolute_poses, added])
-    return vi_map.replace(absolute_poses=table), missing, movement
+    report = _report(before, mission, trajectory, options, (len(rows), missing), [])
+    return vi_map.replace(absolute_poses=table), dataclasses.replace(report, **movement._asdict())
+
+
+def _report(
+    vi_map: VIMap,
+    mission: int,
+    trajectory: Trajectory,
+    options: TrajectoryOptions,
+    counts: tuple[int, int],
+    notes: list[str],
+) -> TrajectoryImport:
+    """Return the report on measurements, given how many were added, and vertices or pairs without."""
+    clock = clock_note(vi_map, mission, trajectory, options)
+    return TrajectoryImport(
+        file=Path(trajectory.source),
+        kind=options.kind,
+        mission=mission_labels(vi_map)[mission],
+        poses_in_file=len(trajectory),
+        added=counts[0],
+        without_pose=counts[1],
+        notes=tuple(note for note in (*notes, clock) if note),
+    )
 
 
 def as_odometry(
     vi_map: VIMap, mission: int, trajectory: Trajectory, options: TrajectoryOptions
-) -> tuple[VIMap, int, list[str]]:
+) -> tuple[VIMap, TrajectoryImport]:
     """Join neighbouring vertices of a mission (row) by the motion of a trajectory.
-
-    Returns:
-        The map, the number of pairs of neighbours that the trajectory does not cover, and notes.
 
     Raises:
         UserError: Nothing of the trajectory is at the time of the mission, the mission has odometry edges
@@ -103,7 +128,7 @@ def as_odometry(
         EstimationError: Another order of the quaternions fits clearly better.
     """
     _check_orientation(trajectory)
-    kind = TransformationKind.ODOMETRY
+    before, kind = vi_map, TransformationKind.ODOMETRY
     vi_map = without_edges(vi_map, mission, kind, trajectory.source, replace=options.replace)
     rows = np.arange(vi_map.vertex_start[mission], vi_map.vertex_start[mission + 1])
     stamps = vi_map.vertices.timestamp_ns[rows]
@@ -127,7 +152,9 @@ def as_odometry(
     vi_map = with_sensor(vi_map, mission, MissionSensor.ODOMETRY_6DOF, words, T_I_S, keys)
     edges = _edges(rows[first], stamps, first, T_R_S, words, options)
     table = tables.TransformationEdges.concatenate([vi_map.transformation_edges, edges])
-    return vi_map.replace(transformation_edges=table), len(rows) - 1 - len(first), notes
+    counts = len(first), len(rows) - 1 - len(first)
+    report = _report(before, mission, trajectory, options, counts, notes)
+    return vi_map.replace(transformation_edges=table), report
 
 
 def as_mission(trajectory: Trajectory, options: TrajectoryOptions) -> VIMap:

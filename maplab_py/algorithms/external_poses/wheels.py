@@ -1,11 +1,11 @@
 """Wheel odometry as edges between neighbouring vertices of a mission."""
 
-from typing import NamedTuple
+from pathlib import Path
 
 import numpy as np
 
 from maplab_py.algorithms.external_poses import trajectories
-from maplab_py.algorithms.external_poses.options import WheelOptions
+from maplab_py.algorithms.external_poses.options import WheelImport, WheelOptions
 from maplab_py.array_types import F64, I64, U64
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
@@ -13,7 +13,14 @@ from maplab_py.geometry.interpolation import interpolate_poses
 from maplab_py.interop.wheel_odometry import WheelTrack
 from maplab_py.sensors import OtherSensor, yaml_entry
 from maplab_py.sensors.wheels import WHEEL_ODOMETRY, wheel_scale
-from maplab_py.vimap import MissionSensor, TransformationKind, VIMap, mission_sensor_id, tables
+from maplab_py.vimap import (
+    MissionSensor,
+    TransformationKind,
+    VIMap,
+    mission_labels,
+    mission_sensor_id,
+    tables,
+)
 from maplab_py.vimap.ids import from_hex, random_ids, to_hex
 
 _COVARIANCE = "T_St_Stp1_fixed_covariance"
@@ -25,19 +32,9 @@ _MAX_DISTANCE_RATIO, _MAX_TURN_RATIO = 2.0, 5.0
 """Wheels that differ more from what the map says have other units, or are those of another mission."""
 
 
-class AttachedWheels(NamedTuple):
-    """A map with wheel odometry, and how it fits."""
-
-    vi_map: VIMap
-    sensor_id: str
-    added: int
-    missing: int  # pairs of neighbours that the file does not cover
-    distance_ratio: float  # of the wheels, at the scale known before, and the map; NaN: no motion
-
-
 def attach_wheels(
     vi_map: VIMap, mission: int, track: WheelTrack, options: WheelOptions
-) -> AttachedWheels:
+) -> tuple[VIMap, WheelImport]:
     """Join neighbouring vertices of a mission (row) by wheel odometry edges.
 
     Edges relate the frames of the wheel sensor at two vertices; its poses are interpolated to their times.
@@ -93,8 +90,16 @@ def attach_wheels(
         sensor_id=np.tile(words, (count, 1)),
     )
     table = tables.TransformationEdges.concatenate([vi_map.transformation_edges, edges])
-    result = vi_map.replace(transformation_edges=table)
-    return AttachedWheels(result, to_hex(words), count, len(rows) - 1 - count, ratio)
+    return vi_map.replace(transformation_edges=table), WheelImport(
+        file=Path(track.source),
+        kind=track.kind,
+        mission=mission_labels(vi_map)[mission],
+        sensor_id=to_hex(words),
+        rows_in_file=len(track),
+        added=count,
+        without_edge=len(rows) - 1 - count,
+        distance_ratio=ratio,
+    )
 
 
 def _given_sensor(vi_map: VIMap, sensor_id: str) -> OtherSensor | None:

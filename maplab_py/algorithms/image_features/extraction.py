@@ -40,8 +40,6 @@ def extract_features(
 
     Args:
         map_folder: Its folder, where its resources are.
-        options: What is extracted.
-        missions: Mission rows, None for all.
 
     Raises:
         UserError: The missions have no images, frames have keypoints that cannot be kept, or there is

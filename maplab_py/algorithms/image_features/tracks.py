@@ -40,10 +40,6 @@ def track_features(
     without a landmark are linked. Matches are taken in the order of their descriptors' differences, and none
     that would put two keypoints of a frame into one track.
 
-    Args:
-        options: Kind of the keypoints and limits of matches.
-        missions: Mission rows, None for all.
-
     Raises:
         EstimationError: There are no such keypoints, or all have a track.
     """

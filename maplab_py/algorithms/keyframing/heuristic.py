@@ -38,10 +38,6 @@ def keyframe(
 
     First and last vertices stay. IMU edges are concatenated and odometry composed over removed
     vertices; landmarks stay where they are but lose the removed observations.
-
-    Args:
-        options: When a vertex becomes a keyframe.
-        missions: Mission rows; None = all.
     """
     reason = choose_keyframes(vi_map, options, missions=missions, progress=progress)
     chosen = mission_mask(vi_map, missions)[vi_map.vertices.mission]

@@ -68,7 +68,6 @@ def existence(
 
     Args:
         evidence: Records (L,).
-        options: Priors.
         at_s: Time [s since 1970]; later evidence is ignored as far as it is not summarised. None = the
             last session of each landmark.
         detection: Detection prior; None = learned from the evidence.

@@ -42,10 +42,6 @@ def evaluate_quality(
     is small compared with its distance, in front of every camera that sees it and not too near or far
     of the closest, with no large reprojection error.
 
-    Args:
-        options: The thresholds.
-        missions: Mission rows; None = all.
-
     Raises:
         MapError: A mission's camera rig or IMU is not in sensors.yaml.
     """

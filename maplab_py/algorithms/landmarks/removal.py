@@ -46,7 +46,6 @@ def remove_invalid_observations(
     quality if they can be triangulated and agree.
 
     Args:
-        options: The limits.
         missions: Rows of the missions that store the landmarks; None = all.
 
     Raises:

@@ -26,8 +26,6 @@ def init_tracks(
     All landmarks of the missions are triangulated afterwards, as in maplab.
 
     Args:
-        options: Thresholds of the quality.
-        missions: Mission rows; None = all.
         across_cameras: Track ids are unique in a mission: keypoints of different cameras with the
             same id show the same point.
 

@@ -24,10 +24,6 @@ def retriangulate(
     parallel, or if the new point is behind one of its cameras; quality evaluation then marks it as
     bad. Store vertices do not change, nor do landmarks of 3-D (lidar) observations.
 
-    Args:
-        options: Thresholds of the quality.
-        missions: Mission rows; None = all.
-
     Raises:
         MapError: A mission's camera rig or IMU is not in sensors.yaml.
     """

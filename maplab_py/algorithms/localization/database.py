@@ -112,7 +112,6 @@ def database_of_map(
     they determined.
 
     Args:
-        missions: Mission rows.
         projection: Projection of the descriptors; None = learned from the tracks.
         feature_type: Type of the descriptors.
         sizes: Lengths [bytes] that they may have; empty = any.

@@ -38,7 +38,6 @@ def guided_matches(
     """Return keypoints and landmarks of matches near a pose, sorted by keypoint.
 
     Args:
-        database: The map.
         T_G_I: Approximate pose (7,) of the query.
         projected: Projected descriptors (N, dimensions) of its keypoints.
         words: Descriptors (N, W) as the map compares them; empty rows for summary maps.

@@ -145,7 +145,6 @@ def _best_places(
         queries: Query vertices (Q,).
         votes: Votes (Q, V), sparse.
         near: Vertices (V, V) that belong to one place, sparse.
-        options: Criteria.
     """
     v = vi_map.vertices
     entries = votes.tocoo()

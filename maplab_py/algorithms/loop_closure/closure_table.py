@@ -107,7 +107,6 @@ def make_edges(
         T_M_A: Poses (N, 7) of the queries in the missions of the places.
         T_A_B: Poses (N, 7) of the places' vertices in the queries.
         covariance: Covariances (N, 6, 6) of T_M_A, [dp, dtheta].
-        options: Scale of the covariance, and variance of the switches.
     """
     relative = _of_relative_pose(covariance, T_M_A, T_A_B) + np.diag(_FLOOR_STD**2)
     return LoopClosureEdges.filled(

@@ -59,7 +59,6 @@ def detect(
 
     Args:
         vi_map: A map whose landmarks have a quality.
-        missions: Mission rows.
         only_other_missions: Ignore places of the query's mission.
         trust_base_frames: Limit the corrections between missions with known base frames too.
         choice: An alignment of two missions that a person has chosen.

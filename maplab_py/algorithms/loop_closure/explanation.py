@@ -146,7 +146,6 @@ def explain_pair(
     Args:
         first: Mission row.
         second: Another one.
-        options: Thresholds of closures.
         min_anchoring_closures: Accepted closures that anchoring needs.
 
     Raises:

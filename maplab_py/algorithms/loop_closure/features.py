@@ -66,7 +66,6 @@ def map_features(
     that two or more keypoints observe form the database.
 
     Args:
-        missions: Mission rows.
         projection: Projection of descriptors.
         dimensions: Dimensions of a projection that is learned; None = as many as in summary maps.
         feature_type: Type of the descriptors.

@@ -56,7 +56,6 @@ def guided_matches(
         vi_map: The map, whose landmarks have a quality.
         closures: Closures; their landmark rows are not used.
         usable: Closures (N,) that may be used.
-        options: Tolerances.
     """
     rows = np.flatnonzero(usable)
     rows = rows[np.lexsort((rows, -closures.inliers[rows], closures.query_vertex[rows]))]

@@ -45,8 +45,6 @@ def match_features(
     the query's mission would displace those of others among the nearest neighbours.
 
     Args:
-        features: Keypoints and landmarks.
-        options: How they are compared.
         rule: Which landmarks a query may match.
         apart: See above.
         asked: Features (rows, ascending) that are the queries; None = all.
@@ -259,7 +257,6 @@ def nearest_rows(
     The index is built only if one of the searches is not remembered.
 
     Args:
-        database: What to search in.
         queries: What to search for (Q).
         k: Neighbours.
         rules: Which database descriptors a query may match.

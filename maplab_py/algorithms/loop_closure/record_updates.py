@@ -152,7 +152,6 @@ def remove_closures(vi_map: VIMap, ids: IdArray) -> tuple[VIMap, ClosureRemovalR
     Observations that were removed since then are not restored.
 
     Args:
-        vi_map: A map with a record.
         ids: Ids (N, 2) of closures in the record.
     """
     record = read_record(vi_map)
@@ -183,9 +182,7 @@ def accept_closures(vi_map: VIMap, ids: IdArray, options: LoopClosureOptions) ->
     """Accept refused closures by hand: each becomes an edge with its recorded pose and uncertainty.
 
     Args:
-        vi_map: A map with a record.
         ids: Ids (N, 2) of closures in the record; those that are accepted already stay as they are.
-        options: Scale of the edges' covariance.
 
     Raises:
         UserError: The pose of a closure was not determined.

@@ -49,7 +49,6 @@ def match_again(
     Images of the same camera at the query and at the place's vertex are compared.
 
     Args:
-        features: Its XFeat features.
         matches: Matches of all candidates.
         which: Rows of those that are matched again.
 

@@ -43,7 +43,6 @@ def close_loops(
 
     Args:
         vi_map: The map; the quality of landmarks is evaluated first where it is unknown.
-        missions: Mission rows, None for all.
         scope: What is left out.
 
     Raises:

@@ -151,7 +151,6 @@ def _with_views(vi_map: VIMap, region: Region, by: Mask, expected: tuple[I64, I6
     """Return a region with the images that see most of it and that should.
 
     Args:
-        vi_map: The map.
         region: The region.
         by: Missions (M,) that miss it.
         expected: Images and landmarks (N,) that they should see.

@@ -193,7 +193,6 @@ def map_at(vi_map: VIMap, map_folder: Path | None, end: str) -> tuple[VIMap, Upd
     """Return the map as it was before its first update with a session after a time, and that update.
 
     Args:
-        vi_map: The map.
         map_folder: Its folder.
         end: The time, as in the dates of updates. None of them is after it: the map stays.
 

@@ -70,8 +70,6 @@ def thin(
 
     Args:
         new: Missions (M,) whose vertices keep their inertial measurements.
-        options: The budget.
-        persistence: Priors of existence.
 
     Raises:
         UserError: The size cannot be met.

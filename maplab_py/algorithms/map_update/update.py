@@ -100,8 +100,6 @@ def update_map(
     Args:
         vi_map: The map; a mission of it is anchored.
         session: One or several missions that are not in the map.
-        options: The budget.
-        persistence: Priors of existence.
         loops: How places are recognised.
         keyframing: Of the session.
         assign_new_ids: Whether the session may be in the map already; it is added once more.
@@ -352,7 +350,6 @@ def gather_all(
     """Add the evidence of all anchored missions, in the order of time, and judge the landmarks.
 
     Args:
-        persistence: Priors of existence.
         session: Another map, whose missions give the evidence instead; it does not come into the map.
         missions: Those (rows) that give the evidence; None = all.
         has_new_loops: The poses do not fit the landmarks yet: a copy of the map is optimised for it.

@@ -73,10 +73,6 @@ def disturb_vertices(
     """Disturb the position and yaw of vertices by random walks that start at each first vertex.
 
     Landmarks move with the vertices that store them; velocities rotate with their vertex.
-
-    Args:
-        options: Magnitude of the random walks.
-        missions: Mission rows; None = all.
     """
     v = vi_map.vertices
     T_M_I, v_M = v.T_M_I.copy(), v.v_M.copy()

@@ -87,7 +87,6 @@ def loop_edges(
 
     Args:
         edges: Loop closures (E).
-        options: Fallback covariance.
         as_given: Edges (E,) whose covariance is not to be widened.
     """
     fallback = np.repeat([options.loop_sigma_m, np.deg2rad(options.loop_sigma_deg)], 3) ** 2

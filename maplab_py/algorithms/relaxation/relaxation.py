@@ -81,7 +81,6 @@ def relax_graph(
     unknown base frame are ignored (closures within such a mission are not).
 
     Args:
-        options: Drift rates and robustness.
         loop_closures: Closures beside those of the map, e.g. just found ones.
         missions: Mission rows that may move and whose closures count; None = all.
         progress: Where iterations are shown, and where cancellation comes from.

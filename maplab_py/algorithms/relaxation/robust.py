@@ -80,7 +80,6 @@ def optimize_robustly(
         trajectory: Edges along missions, not robust.
         loops: Loop closures.
         tilt: Priors of roll and pitch.
-        options: Robustness and iterations.
 
     Raises:
         EstimationError: The poses are not determined, or not finite.

@@ -88,7 +88,6 @@ def calibrate(
 
     Args:
         vi_map: Segments of a database, or a whole map.
-        missions: Missions (rows, None = all).
         segments: Number of segments, for the report.
 
     Raises:

@@ -60,7 +60,6 @@ def calibrate_with_checks(
         parts: Also calibrate on so many parts of the data, and report deviations that are at least
             the standard error of their mean; 0 = none.
         database: Segments of earlier sessions.
-        missions: Missions (rows, None = all).
         batch: Use all data instead of segments.
 
     Raises:

@@ -50,8 +50,6 @@ def prune(
     """Remove segments of some missions, then outdated ones, then those beyond a capacity.
 
     Args:
-        database: Segments.
-        options: What was estimated.
         missions: Beginnings of ids of missions.
         outdated: Test the segments and remove those that contradict the calibration.
         calibration: To test against; None = the joint calibration of all segments.
@@ -129,9 +127,7 @@ def test_segments(
     """Test every segment against a calibration.
 
     Args:
-        database: Segments.
         sensors: The calibration; of other ids, when it has one IMU and one rig.
-        options: What was estimated.
         probability: Of accepting a segment if the calibration is right.
 
     Raises:
@@ -168,7 +164,6 @@ def test_segment(
 
     Args:
         segment: Map of a segment; its sensors have the calibration to test.
-        options: What was estimated.
         probability: Of accepting a segment if the calibration is right.
     """
     from scipy.stats import chi2

@@ -57,7 +57,6 @@ def sparsify(
 
     Args:
         keep: Landmarks to keep.
-        options: Method and parameters of the selection.
         persistence: Priors of existence, where the map has evidence.
 
     Raises:

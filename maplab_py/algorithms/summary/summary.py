@@ -39,7 +39,6 @@ def make_summary_map(
 
     Args:
         vi_map: The map; its base frames must be known.
-        options: Content of the summary map.
         projection: Projection of the descriptors; by default learned from the map's tracks.
         feature_type: Type of the descriptors.
         sizes: Lengths [bytes] that they may have; empty = any.

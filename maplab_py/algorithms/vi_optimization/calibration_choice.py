@@ -104,7 +104,6 @@ def with_contradicted_freed(
     Args:
         vi_map: The map at its optimum.
         options: Of the optimisation; what they free stays free.
-        missions: Mission rows.
     """
     flags: dict[str, Any] = {group.flag: False for group in _GROUPS}
     free = dataclasses.replace(options, **flags, linear_solver_type=_DIRECT)

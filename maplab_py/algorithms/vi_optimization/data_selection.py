@@ -38,7 +38,6 @@ def thinned(vi_map: VIMap, keypoints: I64, options: DataOptions) -> tuple[I64, L
 
     Args:
         keypoints: Observations (O,), grouped by landmark.
-        options: The limits.
 
     Raises:
         NotEnoughMemory: The pairs of vertices that share landmarks do not fit.
@@ -240,7 +239,6 @@ def observations(
 
     Args:
         selection: Selected vertices and landmarks.
-        options: Scales of the loss.
         first_camera: (M,) row of each mission's first camera.
     """
     keypoints = selection.keypoints

@@ -44,7 +44,6 @@ def optimize_around(
 
     Args:
         vertices: New vertices; always free, unless they are a whole cluster without a fixed vertex.
-        options: Of the optimisation.
         max_free: Largest number of further free vertices.
         max_fixed: Largest number of fixed vertices, besides the neighbours along trajectories.
 

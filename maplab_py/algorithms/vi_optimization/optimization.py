@@ -36,8 +36,6 @@ def optimize(
     """Optimise the free states of some missions (rows, None = all).
 
     Args:
-        options: See there.
-        missions: Mission rows.
         fixed_vertices: Vertices (rows) whose states are held fixed.
         watch: Called between iterations.
 

@@ -84,7 +84,6 @@ def parameters_of(
         rig: The cameras.
         imus: Number of IMUs.
         states: States with the blocks of the calibration.
-        options: What to estimate, and the prior deviations.
     """
     names, parameters = options.estimated(), list[Parameter]()
     if "imu" in names and GYRO in states.blocks:

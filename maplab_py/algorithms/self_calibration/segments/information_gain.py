@@ -34,8 +34,6 @@ def select_by_gain(
     original.
 
     Args:
-        options: What to estimate, and the threshold.
-        missions: Missions (rows, None = all).
         max_segments: Stop when this many are selected; 0 = evaluate all.
 
     Raises:

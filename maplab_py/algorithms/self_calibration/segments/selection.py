@@ -195,9 +195,7 @@ def collect(
 
     Args:
         vi_map: Map of one or more missions of one device.
-        options: What to estimate, tables, metric, capacity.
         database: What was collected before; None = an empty one.
-        missions: Missions (rows, None = all).
 
     Raises:
         UserError: The database was made for other parameters, tables or cameras.
