@@ -51,18 +51,18 @@ def _model(scene: MvsScene) -> colmap.ColmapModel:
     order = np.argsort(scene.view, kind="stable")
     images = colmap.ColmapImages(
         id=_ids(len(scene.names)),
-        camera=scene.camera + 1,
+        camera=scene.camera,
+        frame=np.zeros_like(scene.camera),
         T_C_W=scene.T_C_G,
         name=tuple(scene.names),
         keypoint_count=np.bincount(scene.view, minlength=len(scene.names)),
         uv=scene.uv_px[order] + colmap.PIXEL_CENTRE,
-        point=scene.landmark[order] + 1,
+        point=scene.landmark[order],
     )
     points = colmap.ColmapPoints(_ids(len(scene.p_G)), scene.p_G, scene.colours, scene.error_px)
     none = np.zeros(0, dtype=np.int64)
-    return colmap.ColmapModel(
-        cameras, (), colmap.ColmapFrames(none, none, se3.identity(0), none, none), images, points
-    )
+    frames = colmap.ColmapFrames(none, none, se3.identity(0))
+    return colmap.ColmapModel(cameras, (), frames, images, points)
 
 
 def _ids(count: int) -> I64:

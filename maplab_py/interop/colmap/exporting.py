@@ -62,9 +62,14 @@ def export_colmap(
                 write_bytes(folder / file, content, overwrite=overwrite)
         write_bytes(folder / colmap.FILE_NAME, [exported.side_file.content()], overwrite=overwrite)
         if options.colmap_database:
-            features = pycolmap_files.Features(vi_map, exported.frames, exported.keypoints)
-            has_priors = options.colmap_pose_priors
-            pycolmap_files.write_database(model, features, Path(work), has_priors=has_priors)
+            pycolmap_files.write_database(
+                model,
+                vi_map,
+                exported.frames,
+                exported.keypoints,
+                Path(work),
+                has_priors=options.colmap_pose_priors,
+            )
             copy_file(Path(work) / DATABASE, folder / DATABASE, overwrite=overwrite)
     return ColmapExportReport(
         folder=folder,
@@ -178,20 +183,19 @@ def model_of_map(
     landmarks, point = _exported_landmarks(vi_map, keypoints, quality)
     images = colmap.ColmapImages(
         id=np.arange(1, len(frames) + 1),
-        camera=camera_row + 1,
+        camera=camera_row,
+        frame=frame_row,
         T_C_W=se3.inverse(T_W_C),
         name=image_names(vi_map, frames),
         keypoint_count=vi_map.frames.keypoint_count[frames].astype(np.int64),
         uv=vi_map.keypoints.uv_px[keypoints] + colmap.PIXEL_CENTRE,
         point=point,
     )
-    error, mean_error = _errors(vi_map, rigs, images, camera_row, landmarks)
+    error, mean_error = _errors(vi_map, rigs, images, landmarks)
     model = colmap.ColmapModel(
         cameras,
         colmap_rigs,
-        colmap.ColmapFrames(
-            np.arange(1, len(vertex) + 1), rig_row + 1, se3.inverse(T_W_R), frame_row, images.id
-        ),
+        colmap.ColmapFrames(np.arange(1, len(vertex) + 1), rig_row, se3.inverse(T_W_R)),
         images,
         colmap.ColmapPoints(
             landmarks + 1,
@@ -200,7 +204,7 @@ def model_of_map(
             error,
         ),
     )
-    side_file = _side_file(vi_map, rigs, frames, vertex, images)
+    side_file = _side_file(vi_map, rigs, frames, vertex, images, landmarks)
     observations = int(np.count_nonzero(point != colmap.NO_POINT))
     return ExportedModel(model, side_file, frames, keypoints, observations, mean_error)
 
@@ -267,17 +271,16 @@ def _sensors(
     cameras: list[colmap.ColmapCamera] = []
     result = []
     for number, rig in enumerate(rigs, start=1):
-        sensors: list[colmap.Sensor] = []
-        for camera in rig.cameras:
-            cameras.append(colmap.colmap_camera(camera, len(cameras) + 1))
-            sensors.append((colmap.SensorType.CAMERA, len(cameras)))
-        T_S_R = se3.compose(se3.inverse(rig.T_I_C), rig.T_I_C[0])
-        result.append(colmap.ColmapRig(number, tuple(sensors), T_S_R))
+        rows = tuple(range(len(cameras), len(cameras) + len(rig.cameras)))
+        numbered = zip(rig.cameras, rows, strict=True)
+        cameras += [colmap.colmap_camera(camera, row + 1) for camera, row in numbered]
+        T_C_R = se3.compose(se3.inverse(rig.T_I_C), rig.T_I_C[0])
+        result.append(colmap.ColmapRig(number, rows, T_C_R))
     return tuple(cameras), tuple(result)
 
 
 def _exported_landmarks(vi_map: VIMap, keypoints: I64, quality: str) -> tuple[I64, I64]:
-    """Return the rows of observed landmarks of a quality, and the point ids (K,) of keypoints."""
+    """Return the rows of observed landmarks of a quality, and the point (K,) of each keypoint."""
     table = vi_map.landmarks
     wanted = {
         "good": table.quality == LandmarkQuality.GOOD,
@@ -287,39 +290,42 @@ def _exported_landmarks(vi_map: VIMap, keypoints: I64, quality: str) -> tuple[I6
     landmark = vi_map.keypoints.landmark[keypoints].astype(np.int64)
     observed = landmark >= 0
     observed[observed] = wanted[landmark[observed]]
-    point = np.where(observed, landmark + 1, colmap.NO_POINT)
-    return distinct(landmark[observed]), point
+    rows = distinct(landmark[observed])
+    return rows, np.where(observed, np.searchsorted(rows, landmark), colmap.NO_POINT)
 
 
 def _errors(
-    vi_map: VIMap, rigs: list[MapRig], images: colmap.ColmapImages, camera_row: I64, landmarks: I64
+    vi_map: VIMap, rigs: list[MapRig], images: colmap.ColmapImages, landmarks: I64
 ) -> tuple[F64, float]:
     """Return the mean reprojection error (L,) of each landmark [px], and that of all observations."""
     observing = np.flatnonzero(images.point != colmap.NO_POINT)
     image = images.keypoint_image[observing]
-    landmark = images.point[observing] - 1
-    p_C = se3.transform(images.T_C_W[image], vi_map.p_G[landmark])
+    point = images.point[observing]
+    p_C = se3.transform(images.T_C_W[image], vi_map.p_G[landmarks[point]])
     error, seen = np.zeros(len(observing)), np.zeros(len(observing), dtype=np.bool_)
     cameras = [camera for rig in rigs for camera in rig.cameras]
     for row, camera in enumerate(cameras):
-        mine = np.flatnonzero(camera_row[image] == row)
+        mine = np.flatnonzero(images.camera[image] == row)
         uv, seen[mine] = projection.project(camera, p_C[mine])
         error[mine] = np.linalg.norm(uv + colmap.PIXEL_CENTRE - images.uv[observing[mine]], axis=1)
-    place = np.searchsorted(landmarks, landmark[seen])
-    count = np.bincount(place, minlength=len(landmarks))
-    total = np.bincount(place, error[seen], minlength=len(landmarks))
+    count = np.bincount(point[seen], minlength=len(landmarks))
+    total = np.bincount(point[seen], error[seen], minlength=len(landmarks))
     mean = np.where(count > 0, total / np.maximum(count, 1), _UNKNOWN_ERROR_PX)
     return mean, float(np.mean(error[seen])) if np.any(seen) else float("nan")
 
 
 def _side_file(
-    vi_map: VIMap, rigs: list[MapRig], frames: I64, vertex: I64, images: colmap.ColmapImages
+    vi_map: VIMap,
+    rigs: list[MapRig],
+    frames: I64,
+    vertex: I64,
+    images: colmap.ColmapImages,
+    landmarks: I64,
 ) -> colmap.SideFile:
     cameras = [camera.id for rig in rigs for camera in rig.cameras]
     used = np.unique(vi_map.vertices.mission[vertex])
-    order = np.flatnonzero(images.point != colmap.NO_POINT)
-    point, first = np.unique(images.point[order], return_index=True)
-    observing = order[first]
+    _, first = np.unique(images.point, return_index=True)  # each landmark has a point
+    observing = first[images.point[first] != colmap.NO_POINT]
     image = images.keypoint_image[observing]
     return colmap.SideFile(
         mission_id=vi_map.missions.id[used],
@@ -332,11 +338,11 @@ def _side_file(
         image_vertex=np.searchsorted(vertex, vi_map.frames.vertex[frames]),
         image_frame_id=vi_map.frames.id[frames],
         image_time_ns=vi_map.frames.timestamp_ns[frames],
-        point=point,
+        point=landmarks + 1,
         point_image=image,
         point_keypoint=observing - images.keypoint_start[image],
-        landmark_id=vi_map.landmarks.id[point - 1],
-        landmark_quality=vi_map.landmarks.quality[point - 1].astype(np.int64),
+        landmark_id=vi_map.landmarks.id[landmarks],
+        landmark_quality=vi_map.landmarks.quality[landmarks].astype(np.int64),
         rig=np.arange(1, len(rigs) + 1),
         rig_id=np.array([from_hex(rig.id) for rig in rigs]),
         T_I_R=np.array([rig.T_I_C[0] for rig in rigs]),

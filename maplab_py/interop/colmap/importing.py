@@ -16,7 +16,7 @@ from maplab_py.geometry import interpolation, se3, so3
 from maplab_py.geometry.alignment import apply_similarity, umeyama
 from maplab_py.input_files import read_foreign_text
 from maplab_py.interop.colmap import features, reading, to_map, undistortion
-from maplab_py.interop.colmap.model import ColmapModel, SideFile, has_model
+from maplab_py.interop.colmap.model import ColmapModel, SideFile, has_model, picked
 from maplab_py.interop.colmap.options import ColmapImportOptions, ColmapImportReport
 from maplab_py.interop.stamps import IMAGES, parse_stamps
 from maplab_py.interop.trajectories import Trajectory, read_trajectory
@@ -95,14 +95,12 @@ def import_colmap(
     )
 
 
-def _times(model: ColmapModel, side: SideFile | None, options: ColmapImportOptions) -> I64:
+def _times(model: ColmapModel, side: SideFile, options: ColmapImportOptions) -> I64:
     """Return the times (N,) of images; the side file has those of its images."""
     known = np.full(len(model.images.id), -1, dtype=np.int64)
-    if side is not None and options.timestamps_from == "name":
+    if options.timestamps_from == "name":
         known = to_map.side_images(model, side)
-    times_ns = np.zeros(len(known), dtype=np.int64)
-    if side is not None:
-        times_ns[known >= 0] = side.image_time_ns[known[known >= 0]]
+    times_ns = picked(side.image_time_ns, known, np.zeros(len(known), dtype=np.int64))
     new = np.flatnonzero(known < 0)
     times_ns[new] = image_times(tuple(model.images.name[row] for row in new.tolist()), options)
     return times_ns
@@ -124,24 +122,23 @@ def _place(model: ColmapModel, bodies: to_map.BodyFrames, options: ColmapImportO
 
 
 def _metric_missions(
-    bodies: to_map.BodyFrames, side: SideFile | None, placing: Placing, options: ColmapImportOptions
+    bodies: to_map.BodyFrames, side: SideFile, placing: Placing, options: ColmapImportOptions
 ) -> Mask:
     """Return the missions (M,) whose scale and gravity are known."""
     metric = np.full(len(bodies.mission_rig), placing.is_metric, dtype=np.bool_)
-    if side is not None and not options.scale and not options.gravity:
-        rows = bodies.mission_row
-        metric |= (rows >= 0) & (side.is_metric[rows] != 0)
+    if not options.scale and not options.gravity:
+        metric |= picked(side.is_metric != 0, bodies.mission_row, np.zeros_like(metric))
     return metric
 
 
-def _notes(vi_map: VIMap, side: SideFile | None) -> tuple[str, ...]:
+def _notes(vi_map: VIMap, side: SideFile) -> tuple[str, ...]:
     notes = []
     if not all(is_metric(vi_map, row) for row in range(len(vi_map.missions))):
         notes.append(
             "scale or gravity are arbitrary: optvi will refuse inertial terms; give --align_to=TRAJECTORY, "
             "or --scale and --gravity"
         )
-    if side is not None:
+    if len(side.image_name):
         notes.append("ids, times and body frames come from maplab.npz beside the model")
     return tuple(notes)
 
@@ -270,15 +267,10 @@ def with_poses(model: ColmapModel, choice: str = "") -> tuple[ColmapModel, str]:
         choice: images, frames, or empty = the images that differ from what rigs and frames say.
     """
     images, frames = model.images, model.frames
-    of_camera = {
-        number: (row, pose)
-        for rig in model.rigs
-        for row, (number, pose) in enumerate(zip(rig.cameras, rig.T_C_R, strict=True))
-    }
-    sensor = np.array([of_camera[camera][0] for camera in images.camera.tolist()], dtype=np.int64)
-    T_S_R = np.array([of_camera[camera][1] for camera in images.camera.tolist()]).reshape(-1, 7)
-    order = np.argsort(frames.image_id, kind="stable")
-    frame = frames.image_frame[order][np.searchsorted(frames.image_id[order], images.id)]
+    T_C_R = np.full((len(model.cameras), 7), np.nan)
+    for rig in model.rigs:
+        T_C_R[list(rig.cameras)] = rig.T_C_R
+    frame, place, T_S_R = images.frame, model.place_in_rig[images.camera], T_C_R[images.camera]
     T_R_W = se3.compose(se3.inverse(T_S_R), images.T_C_W)
     apart = se3.local(frames.T_R_W[frame], T_R_W)
     turned, moved = (np.linalg.norm(apart[:, k : k + 3], axis=1) for k in (3, 0))
@@ -294,7 +286,7 @@ def with_poses(model: ColmapModel, choice: str = "") -> tuple[ColmapModel, str]:
         return model, f"{said}: those of the frames are taken"
     known = np.isfinite(T_R_W).all(axis=1) & (differs | (choice == "images"))
     rows = np.flatnonzero(known)
-    rows = rows[np.lexsort((sensor[rows], frame[rows]))]
+    rows = rows[np.lexsort((place[rows], frame[rows]))]
     changed, first = np.unique(frame[rows], return_index=True)
     poses = frames.T_R_W.copy()
     poses[changed] = T_R_W[rows[first]]

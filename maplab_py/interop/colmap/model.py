@@ -7,19 +7,19 @@ Source: COLMAP's documentation, "Output Format", of version 4.
 
 import dataclasses
 import io
-from enum import IntEnum
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64, U8, U64
+from maplab_py.array_types import F64, I64, U8, U64, NDArray
 from maplab_py.errors import MapError, UserError
 from maplab_py.input_files import read_npz
 from maplab_py.sensors.camera import DISTORTION_SIZE, Camera, Distortion, Projection
 from maplab_py.vimap.table import starts_of_counts
 
+_Kind = TypeVar("_Kind", bound=np.generic)
 NO_POINT = -1
 """Point of a keypoint that observes none."""
 PIXEL_CENTRE = 0.5
@@ -34,15 +34,8 @@ ELEMENT = np.dtype([("image", "<u4"), ("keypoint", "<u4")])
 """Keypoint of an image, point without its track, and element of a track in binary files."""
 
 
-class SensorType(IntEnum):
-    """Kinds of sensors of a rig (COLMAP's values)."""
-
-    CAMERA = 0
-    IMU = 1
-
-
-Sensor = tuple[int, int]
-"""Type (`SensorType`) and id of a sensor."""
+CAMERA_SENSOR = 0
+"""COLMAP's number of the cameras among the sensors of a rig."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -58,32 +51,20 @@ class ColmapCamera:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ColmapRig:
-    """Sensors with their poses; the first is the reference sensor, whose frame is R."""
+    """Cameras with their poses; in files that are written the first is the reference, whose frame is R."""
 
     id: int
-    sensors: tuple[Sensor, ...]
-    T_S_R: F64  # (n, 7); NaN where the file has none
-
-    @property
-    def cameras(self) -> list[int]:
-        """Ids of the cameras among the sensors."""
-        return [number for kind, number in self.sensors if kind == SensorType.CAMERA]
-
-    @property
-    def T_C_R(self) -> F64:
-        """Poses of the cameras."""
-        return self.T_S_R[[kind == SensorType.CAMERA for kind, _ in self.sensors]]
+    cameras: tuple[int, ...]  # rows
+    T_C_R: F64  # (n, 7); NaN where the file has none
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ColmapFrames:
-    """Images of a rig at one time, with the pose of the rig."""
+    """Poses of rigs at the times of their images."""
 
     id: I64  # (F,)
-    rig: I64  # (F,) ids
+    rig: I64  # (F,) rows
     T_R_W: F64  # (F, 7)
-    image_frame: I64  # (D,) rows of frames that have images
-    image_id: I64  # (D,)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -91,12 +72,13 @@ class ColmapImages:
     """Images, each with consecutive rows of keypoints."""
 
     id: I64  # (N,)
-    camera: I64  # (N,) ids
+    camera: I64  # (N,) rows
+    frame: I64  # (N,) rows
     T_C_W: F64  # (N, 7)
     name: tuple[str, ...]
     keypoint_count: I64  # (N,)
     uv: F64  # (K, 2) in COLMAP's pixels
-    point: I64  # (K,) ids, NO_POINT where there is none
+    point: I64  # (K,) rows, NO_POINT where there is none
 
     @cached_property
     def keypoint_start(self) -> I64:
@@ -113,7 +95,7 @@ class ColmapImages:
 class ColmapPoints:
     """Points; the images say which keypoints observe them."""
 
-    id: I64  # (L,)
+    id: I64  # (L,) ascending
     p_W: F64  # (L, 3)
     colour: U8  # (L, 3) red, green, blue
     error_px: F64  # (L,) mean reprojection error
@@ -121,7 +103,7 @@ class ColmapPoints:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ColmapModel:
-    """A whole model."""
+    """A whole model, with rows in place of the ids by which its files refer to each other."""
 
     cameras: tuple[ColmapCamera, ...]
     rigs: tuple[ColmapRig, ...]
@@ -129,15 +111,34 @@ class ColmapModel:
     images: ColmapImages
     points: ColmapPoints
 
-    @property
-    def camera_ids(self) -> I64:
-        """Ids (C,) of the cameras."""
-        return np.array([camera.id for camera in self.cameras], dtype=np.int64)
+    @cached_property
+    def place_in_rig(self) -> I64:
+        """Place (C,) of each camera among those of its rig."""
+        place = np.zeros(len(self.cameras), dtype=np.int64)
+        for rig in self.rigs:
+            place[list(rig.cameras)] = np.arange(len(rig.cameras))
+        return place
 
-    @property
-    def rig_ids(self) -> I64:
-        """Ids (R,) of the rigs."""
-        return np.array([rig.id for rig in self.rigs], dtype=np.int64)
+    @cached_property
+    def point_id(self) -> I64:
+        """Id (K,) of the point of every keypoint, NO_POINT where there is none."""
+        return picked(self.points.id, self.images.point, np.full(len(self.images.point), NO_POINT))
+
+
+def picked(values: NDArray[Any], rows: I64, default: NDArray[_Kind]) -> NDArray[_Kind]:
+    """Return the values of rows, a default (N, ...) where a row is -1."""
+    result, known = default.copy(), rows >= 0
+    result[known] = values[rows[known]]
+    return result
+
+
+def rows_of(ids: I64, wanted: I64) -> I64:
+    """Return the rows of wanted ids in a column of unique ids, -1 where they are not."""
+    if not len(ids):
+        return np.full(len(wanted), -1, dtype=np.int64)
+    order = np.argsort(ids, kind="stable")
+    place = np.minimum(np.searchsorted(ids[order], wanted), len(ids) - 1)
+    return np.where(ids[order[place]] == wanted, order[place], -1).astype(np.int64)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -292,15 +293,16 @@ class SideFile:
         return stream.getvalue()
 
     @classmethod
-    def read(cls, folder: Path) -> Self | None:
-        """Read the file of a model's folder; None if there is none.
+    def read(cls, folder: Path) -> Self:
+        """Read the file of a model's folder; without one there are no rows.
 
         Raises:
             MapError: The file is damaged, or of a newer version.
         """
         path = folder / FILE_NAME
         if not path.is_file():
-            return None
+            columns = [(field.name, *_column(field.name)) for field in dataclasses.fields(cls)]
+            return cls(**{name: np.zeros((0, *width), kind[0]) for name, kind, width in columns})
         without = "delete it to import the model with new ids"
         try:
             arrays = read_npz(path)
@@ -322,7 +324,6 @@ _COLUMNS = {
     "rig": ("rig", "rig_id", "T_I_R"),
     "camera": ("camera", "camera_id"),
 }
-_WIDTH = {"T_I_R": 7}
 _REFERENCES = {
     "vertex_mission": "mission_id",
     "image_vertex": "vertex_id",
@@ -330,14 +331,23 @@ _REFERENCES = {
 }
 
 
-def _fits(arrays: dict[str, np.ndarray[Any, Any]]) -> bool:
+def _column(name: str) -> tuple[tuple[str, ...], tuple[int, ...]]:
+    """Return the kinds and the width of a column."""
+    if name.endswith("_name"):
+        return ("U",), ()
+    if name == "T_I_R":
+        return ("f",), (7,)
+    return (("u8", "i8"), (2,)) if name.endswith("_id") else (("i8", "u8"), ())
+
+
+def _fits(arrays: dict[str, NDArray[Any]]) -> bool:
     """Return whether the columns have equal lengths, the right widths, and rows that exist."""
     for leader, columns in _COLUMNS.items():
         for name in columns:
-            width = _WIDTH.get(name, 2 if name.endswith("_id") else 0)
-            wanted = (len(arrays[leader]), width) if width else (len(arrays[leader]),)
-            kind = "U" if name.endswith("_name") else "f" if width == 7 else "iu"
-            if arrays[name].shape != wanted or arrays[name].dtype.kind not in kind:
+            kinds, width = _column(name)
+            if arrays[name].shape != (len(arrays[leader]), *width) or all(
+                arrays[name].dtype.kind != kind[0] for kind in kinds
+            ):
                 return False
     return all(
         np.all((arrays[rows] >= 0) & (arrays[rows] < len(arrays[table])))

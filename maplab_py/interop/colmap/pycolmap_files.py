@@ -4,7 +4,6 @@ Some other functions of it abort a process that has imported cv2.
 """
 
 import contextlib
-import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -26,15 +25,6 @@ _MAX_GAP = 50
 """Pairs of images are matched up to this many observations of a landmark apart."""
 _MIN_MATCHES = 15
 """COLMAP's least number of inliers of a pair."""
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Features:
-    """Keypoints of a map in the order of a model's."""
-
-    vi_map: VIMap
-    frames: I64  # (N,) rows of the images
-    keypoints: I64  # (K,) rows
 
 
 def write_text_model(
@@ -67,9 +57,19 @@ def rays_of(camera: colmap.ColmapCamera, uv: F64) -> F64:
 
 
 def write_database(
-    model: colmap.ColmapModel, features: Features, folder: Path, *, has_priors: bool
+    model: colmap.ColmapModel,
+    vi_map: VIMap,
+    frames: I64,
+    keypoints: I64,
+    folder: Path,
+    *,
+    has_priors: bool,
 ) -> None:
     """Write `database.db` into a folder for temporary files: keypoints, descriptors, matches and priors.
+
+    Args:
+        frames: Rows (N,) of the images in the map.
+        keypoints: Rows (K,) of their keypoints.
 
     Raises:
         MapError: pycolmap fails.
@@ -86,7 +86,7 @@ def write_database(
                 store.write_frame(frame, use_frame_id=True)
             for image in sorted(content.images.values(), key=lambda entry: entry.image_id):
                 store.write_image(image, use_image_id=True)
-            _write_features(pycolmap, store, model.images, features)
+            _write_features(pycolmap, store, model.images, vi_map, frames, keypoints)
             _write_matches(pycolmap, store, model.images)
             for image in content.images.values() if has_priors else ():
                 prior = pycolmap.PosePrior()
@@ -122,14 +122,14 @@ def _reconstruction(model: colmap.ColmapModel, folder: Path) -> Any:
 
 
 def _write_features(
-    pycolmap: Any, store: Any, images: colmap.ColmapImages, features: Features
+    pycolmap: Any, store: Any, images: colmap.ColmapImages, vi_map: VIMap, frames: I64, rows: I64
 ) -> None:
     """Write keypoints: x, y, scale, orientation (0); an image with several kinds of descriptors gets none."""
-    table, kinds = features.vi_map.keypoints, pycolmap.FeatureExtractorType
+    table, kinds = vi_map.keypoints, pycolmap.FeatureExtractorType
     keypoints = np.zeros((len(images.uv), 4), dtype=np.float32)
-    scale = table.scale[features.keypoints]
+    scale = table.scale[rows]
     keypoints[:, :2], keypoints[:, 2] = images.uv, np.where(scale > 0.0, scale, 1.0)
-    blocks = features.vi_map.frames.descriptor_blocks[features.frames]
+    blocks = vi_map.frames.descriptor_blocks[frames]
     start = images.keypoint_start.tolist()
     for row, image in enumerate(images.id.tolist()):
         check_cancelled()
@@ -139,7 +139,7 @@ def _write_features(
         if len(stored) == 1:
             width, *kind = stored.pop()
             is_sift = kind == [DescriptorDepth.UINT8, FeatureType.SIFT]
-            data = np.ascontiguousarray(table.descriptor[features.keypoints[part], :width])
+            data = np.ascontiguousarray(table.descriptor[rows[part], :width])
             kind_of_colmap = kinds.SIFT if is_sift else kinds.UNDEFINED
             store.write_descriptors(image, pycolmap.FeatureDescriptors(kind_of_colmap, data))
 

@@ -1,5 +1,6 @@
 """Read the model of a folder, in either format, and check the references within it."""
 
+import dataclasses
 import struct
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from maplab_py.sensors import Camera
 _HEADER_BYTES = 4096
 _NEEDED = ("cameras", "images", "points3D")
 _CAMERA_MODELS = {model.name: model.number for model in colmap.MODELS.values()}
-_SENSORS = {kind.name: int(kind) for kind in colmap.SensorType}
+_SENSORS = {"CAMERA": colmap.CAMERA_SENSOR, "IMU": 1}
 
 
 def read_model(folder: Path) -> colmap.ColmapModel:
@@ -36,7 +37,6 @@ def read_model(folder: Path) -> colmap.ColmapModel:
             f"--colmap_folder={folder}: has no COLMAP model (cameras, images, points3D as .bin or .txt)"
             f"{_models_below(folder)}"
         )
-    check_model(model, folder)
     return model
 
 
@@ -83,7 +83,7 @@ def _count(path: Path) -> str:
 
 
 def _read_files(folder: Path, suffix: str) -> colmap.ColmapModel:
-    """Read the files of a model; references between them are not checked.
+    """Read the files of a model: check that ids are unique, and replace references to them by rows.
 
     Models of versions without rigs and frames get a rig of each camera, and a frame of each image.
     """
@@ -92,15 +92,66 @@ def _read_files(folder: Path, suffix: str) -> colmap.ColmapModel:
     points = _points(records_of(folder / f"points3D{suffix}"))
     rigs_file, frames_file = (folder / f"{kind}{suffix}" for kind in ("rigs", "frames"))
     if rigs_file.exists() or frames_file.exists():
-        rigs, frames = _rigs(records_of(rigs_file)), _frames(records_of(frames_file))
-        return colmap.ColmapModel(cameras, rigs, frames, images, points)
-    rigs = tuple(
-        colmap.ColmapRig(number, ((colmap.SensorType.CAMERA, number),), se3.identity(1))
-        for number in np.unique(images.camera).tolist()
+        rigs, (frames, owner, image) = (
+            _rigs(records_of(rigs_file)),
+            _frames(records_of(frames_file)),
+        )
+    else:
+        used = np.unique(images.camera).tolist()
+        rigs = tuple(colmap.ColmapRig(number, (number,), se3.identity(1)) for number in used)
+        frames = colmap.ColmapFrames(images.id, images.camera, images.T_C_W)
+        owner, image = np.arange(len(images.id)), images.id
+    if not len(images.id):
+        raise MapError(f"{folder}: the model has no images with a pose: nothing can be imported")
+    camera_ids, rig_ids, mounted = (
+        np.array(list(numbers), dtype=np.int64)
+        for numbers in (
+            (camera.id for camera in cameras),
+            (rig.id for rig in rigs),
+            (number for rig in rigs for number in rig.cameras),
+        )
     )
-    rows = np.arange(len(images.id))
-    frames = colmap.ColmapFrames(images.id, images.camera, images.T_C_W, rows, images.id)
-    return colmap.ColmapModel(cameras, rigs, frames, images, points)
+    for noun, ids in (
+        ("camera", camera_ids),
+        ("rig", rig_ids),
+        ("camera in a rig", mounted),
+        ("frame", frames.id),
+        ("image", images.id),
+        ("image in a frame", image),
+        ("point", points.id),
+    ):
+        values, counts = np.unique(ids, return_counts=True)
+        _refuse(folder, f"{noun} {{}} is there twice", values, counts > 1)
+    names, counts = np.unique(np.array(images.name), return_counts=True)
+    if np.any(counts > 1):
+        raise MapError(
+            f"{folder}: two images are called '{names[counts > 1][0]}': give each its own name"
+        )
+    camera = _known(
+        folder, "an image names camera {}, which is not there", images.camera, camera_ids
+    )
+    rig = _known(folder, "a frame names rig {}, which is not there", frames.rig, rig_ids)
+    _known(folder, "a rig names camera {}, which is not there", mounted, camera_ids)
+    _known(folder, "no rig has camera {}", images.camera, mounted)
+    frame = owner[_known(folder, "no frame has image {}", images.id, image)]
+    order, observing = np.argsort(points.id), images.point != colmap.NO_POINT
+    points = colmap.ColmapPoints(*(column[order] for column in vars(points).values()))
+    point, named = images.point.copy(), images.point[observing]
+    point[observing] = _known(
+        folder, "a keypoint names point {}, which is not there", named, points.id
+    )
+    return colmap.ColmapModel(
+        cameras,
+        tuple(
+            dataclasses.replace(
+                rig, cameras=tuple(colmap.rows_of(camera_ids, np.array(rig.cameras)).tolist())
+            )
+            for rig in rigs
+        ),
+        dataclasses.replace(frames, rig=rig),
+        dataclasses.replace(images, camera=camera, frame=frame, point=point),
+        points,
+    )
 
 
 def _cameras(file: Records) -> tuple[colmap.ColmapCamera, ...]:
@@ -119,21 +170,25 @@ def _cameras(file: Records) -> tuple[colmap.ColmapCamera, ...]:
 
 
 def _rigs(file: Records) -> tuple[colmap.ColmapRig, ...]:
+    """Return the rigs with the ids of their cameras; poses are on whatever sensor is the reference."""
     rigs = []
     for _ in file.records(8):
         number, count = file.integers("II")
-        sensors: list[colmap.Sensor] = []
+        cameras: list[int] = []
         poses: list[F64] = []
-        for row in range(count):
-            sensors.append((file.word(_SENSORS), *file.integers("I")))
-            is_known = not row or file.integers("B")[0]
-            pose = file.pose() if row and is_known else se3.identity()
-            poses.append(pose if is_known else np.full(7, np.nan))
-        rigs.append(colmap.ColmapRig(number, tuple(sensors), _rows(poses)))
+        for place in range(count):
+            kind, (sensor,) = file.word(_SENSORS), file.integers("I")
+            is_known = not place or file.integers("B")[0]
+            pose = file.pose() if place and is_known else se3.identity()
+            if kind == colmap.CAMERA_SENSOR:
+                cameras.append(sensor)
+                poses.append(pose if is_known else np.full(7, np.nan))
+        rigs.append(colmap.ColmapRig(number, tuple(cameras), _rows(poses)))
     return tuple(rigs)
 
 
-def _frames(file: Records) -> colmap.ColmapFrames:
+def _frames(file: Records) -> tuple[colmap.ColmapFrames, I64, I64]:
+    """Return the frames with the ids of their rigs, and rows of frames and ids of the images in them."""
     poses: list[F64] = []
     heads: list[tuple[int, int]] = []
     images: list[tuple[int, int]] = []
@@ -143,9 +198,9 @@ def _frames(file: Records) -> colmap.ColmapFrames:
         poses.append(file.pose())
         for _ in range(*file.integers("I")):
             kind, (_, image) = file.word(_SENSORS), file.integers("IQ")
-            if kind == colmap.SensorType.CAMERA:
+            if kind == colmap.CAMERA_SENSOR:
                 images.append((row, image))
-    return colmap.ColmapFrames(*_columns(heads), _rows(poses), *_columns(images))
+    return colmap.ColmapFrames(*_columns(heads), _rows(poses)), *_columns(images)
 
 
 def _images(file: Records) -> colmap.ColmapImages:
@@ -160,8 +215,11 @@ def _images(file: Records) -> colmap.ColmapImages:
     table = np.concatenate(keypoints)
     if not np.all(np.isfinite(table["uv"])):
         raise file.damaged("it has keypoints that are not finite")
+    ids, cameras = _columns(heads)
     return colmap.ColmapImages(
-        *_columns(heads),
+        ids,
+        cameras,
+        np.zeros_like(ids),
         _rows(poses),
         tuple(names),
         np.array([len(part) for part in keypoints[1:]], dtype=np.int64),
@@ -188,51 +246,16 @@ def _rows(poses: list[F64]) -> F64:
     return np.array(poses, dtype=np.float64).reshape(-1, 7)
 
 
-def check_model(model: colmap.ColmapModel, source: Path) -> None:
-    """Check that ids are unique, that what is named exists, and that there are images.
-
-    Raises:
-        MapError: A check fails; names the source and the id.
-    """
-    images, frames, points = model.images, model.frames, model.points
-    if not len(images.id):
-        raise MapError(f"{source}: the model has no images with a pose: nothing can be imported")
-    cameras, rigs = model.camera_ids, model.rig_ids
-    sensors = np.array([c for rig in model.rigs for c in rig.cameras], dtype=np.int64)
-    for noun, ids in (
-        ("camera", cameras),
-        ("rig", rigs),
-        ("camera in a rig", sensors),
-        ("frame", frames.id),
-        ("image", images.id),
-        ("image in a frame", frames.image_id),
-        ("point", points.id),
-    ):
-        values, counts = np.unique(ids, return_counts=True)
-        _refuse(source, f"{noun} {{}} is there twice", values, counts > 1)
-    names, counts = np.unique(np.array(images.name), return_counts=True)
-    if np.any(counts > 1):
-        raise MapError(
-            f"{source}: two images are called '{names[counts > 1][0]}': give each its own name"
-        )
-    _known(source, "an image names camera {}", images.camera, cameras)
-    _known(source, "a frame names rig {}", frames.rig, rigs)
-    _known(source, "no frame has image {}", images.id, frames.image_id)
-    _known(source, "no rig has camera {}", images.camera, sensors)
-    observed = images.point[images.point != colmap.NO_POINT]
-    _known(source, "a keypoint names point {}", observed, points.id)
-
-
-def _known(source: Path, sentence: str, named: I64, known: I64) -> None:
-    _refuse(source, f"{sentence}, which is not there", named, ~np.isin(named, known))
+def _known(source: Path, sentence: str, named: I64, known: I64) -> I64:
+    """Return the rows of named ids in a column of ids."""
+    rows = colmap.rows_of(known, named)
+    _refuse(source, sentence, named, rows < 0)
+    return rows
 
 
 def _refuse(source: Path, sentence: str, ids: I64, wrong: Mask) -> None:
     if np.any(wrong):
-        text = sentence.format(int(ids[wrong][0]))
-        if text.startswith("no "):
-            text = text.removesuffix(", which is not there")
-        raise MapError(f"{source}: is damaged: {text}; {REMEDY}")
+        raise MapError(f"{source}: is damaged: {sentence.format(int(ids[wrong][0]))}; {REMEDY}")
 
 
 _FILES = ("cameras.bin", "cameras.txt")
@@ -275,7 +298,6 @@ def _rig(model: colmap.ColmapModel, folder: Path) -> tuple[tuple[colmap.ColmapCa
             "cameras.txt of one camera"
         )
     rig = model.rigs[0]
-    by_id = {camera.id: camera for camera in model.cameras}
     if not np.isfinite(rig.T_C_R).all():
         raise UserError(f"{folder}: rig {rig.id} has a camera without pose: reconstruct it first")
-    return tuple(by_id[number] for number in rig.cameras), se3.inverse(rig.T_C_R)
+    return tuple(model.cameras[row] for row in rig.cameras), se3.inverse(rig.T_C_R)

@@ -14,6 +14,8 @@ from maplab_py.interop.colmap.model import (
     ColmapRig,
     SideFile,
     map_camera,
+    picked,
+    rows_of,
 )
 from maplab_py.sensors import CameraRig, SensorSet, sensor_set
 from maplab_py.vimap import MissionSensor, VIMap, from_hex, ragged_rows, random_ids, tables, to_hex
@@ -48,35 +50,24 @@ class BodyFrames:
     T_I_R: F64  # (R, 7) by rig row
 
 
-def body_frames(model: ColmapModel, times_ns: I64, side: SideFile | None) -> BodyFrames:
+def body_frames(model: ColmapModel, times_ns: I64, side: SideFile) -> BodyFrames:
     """Put the frames that have images into missions: those of the side file, else one of each rig.
 
     Args:
         times_ns: Times (N,) of its images.
-        side: Side file, None = there is none.
 
     Raises:
         UserError: Two frames of a mission have the same time.
     """
-    image_row = _rows_of(model.images.id, model.frames.image_id)
-    kept = image_row >= 0
-    owner, image = model.frames.image_frame[kept], image_row[kept]
-    order = np.lexsort((image, owner))
-    owner, image = owner[order], image[order]
-    frame, first = np.unique(owner, return_index=True)
-    time_ns = np.minimum.reduceat(times_ns[image], first)
-    side_vertex = np.full(len(frame), -1, dtype=np.int64)
-    rig = _rows_of(model.rig_ids, model.frames.rig[frame])
-    T_I_R = se3.identity(len(model.rigs))
-    side_mission = np.full(len(frame), -1, dtype=np.int64)
-    if side is not None:
-        known = side_images(model, side)[image[first]]
-        side_vertex = np.where(known >= 0, side.image_vertex[known], -1)
-        is_known = side_vertex >= 0
-        time_ns = np.where(is_known, side.vertex_time_ns[side_vertex], time_ns)
-        side_mission = np.where(is_known, side.vertex_mission[side_vertex], -1)
-        rows = _rows_of(side.rig, model.rig_ids)
-        T_I_R[rows >= 0] = side.T_I_R[rows[rows >= 0]]
+    order = np.argsort(model.images.frame, kind="stable")
+    frame, first = np.unique(model.images.frame[order], return_index=True)
+    time_ns = np.minimum.reduceat(times_ns[order], first)
+    none = np.full(len(frame), -1, dtype=np.int64)
+    rig, rig_ids = model.frames.rig[frame], np.array([rig.id for rig in model.rigs])
+    side_vertex = picked(side.image_vertex, side_images(model, side)[order[first]], none)
+    time_ns = picked(side.vertex_time_ns, side_vertex, time_ns)
+    side_mission = picked(side.vertex_mission, side_vertex, none)
+    T_I_R = picked(side.T_I_R, rows_of(side.rig, rig_ids), se3.identity(len(rig_ids)))
     groups, mission = np.unique(
         np.stack([side_mission < 0, side_mission, rig], axis=1), axis=0, return_inverse=True
     )
@@ -106,7 +97,7 @@ def map_of_model(
     model: ColmapModel,
     bodies: BodyFrames,
     times_ns: I64,
-    side: SideFile | None,
+    side: SideFile,
     *,
     T_G_W: F64,
     scale: float,
@@ -119,7 +110,6 @@ def map_of_model(
     Args:
         bodies: Its frames by mission.
         times_ns: Times (N,) of its images.
-        side: Side file, None = there is none.
         T_G_W: Pose (7,) of the model.
         scale: Metres per unit of the model.
         is_metric: Missions (M,) whose scale and gravity are known; others are marked.
@@ -140,7 +130,6 @@ def map_of_model(
     )
     count = len(bodies.frame)
     missions = len(bodies.mission_rig)
-    vertex_id = None if side is None else side.vertex_id
     vi_map = VIMap(
         sensors=sensors,
         missions=_missions(bodies, side, sensor_id, rng),
@@ -149,7 +138,7 @@ def map_of_model(
         ),
         vertices=tables.Vertices.filled(
             count,
-            id=_restored(random_ids(count, rng), bodies.side_vertex, vertex_id),
+            id=_restored(random_ids(count, rng), bodies.side_vertex, side.vertex_id),
             mission=bodies.mission,
             T_M_I=T_G_I,
             timestamp_ns=bodies.time_ns,
@@ -177,18 +166,19 @@ def side_images(model: ColmapModel, side: SideFile) -> I64:
 def _sensors(
     model: ColmapModel,
     bodies: BodyFrames,
-    side: SideFile | None,
+    side: SideFile,
     scale: float,
     is_metric: Mask,
     rng: np.random.Generator,
 ) -> tuple[SensorSet, U64]:
     """Return the sensors, and their ids (M, kinds, 2) by mission."""
-    camera_rows = {camera.id: row for row, camera in enumerate(model.cameras)}
-    camera_id = random_ids(len(model.cameras), rng)
-    rig_id = random_ids(len(model.rigs), rng)
-    if side is not None:
-        camera_id = _restored(camera_id, _rows_of(side.camera, model.camera_ids), side.camera_id)
-        rig_id = _restored(rig_id, _rows_of(side.rig, model.rig_ids), side.rig_id)
+    camera_id, rig_id = (
+        _restored(random_ids(len(parts), rng), rows_of(known, np.array([p.id for p in parts])), ids)
+        for parts, known, ids in (
+            (model.cameras, side.camera, side.camera_id),
+            (model.rigs, side.rig, side.rig_id),
+        )
+    )
     sensors: dict[str, CameraRig | sensor_set.OtherSensor] = {}
     extrinsics: dict[str, sensor_set.Extrinsics] = {}
     sensor_id = np.zeros((len(bodies.mission_rig), len(MissionSensor), 2), dtype=np.uint64)
@@ -197,8 +187,7 @@ def _sensors(
         rig, name = model.rigs[row], to_hex(rig_id[row])
         T_C_R = camera_poses(rig, scale)
         cameras = tuple(
-            map_camera(model.cameras[place], to_hex(camera_id[place]))
-            for place in (camera_rows[number] for number in rig.cameras)
+            map_camera(model.cameras[camera], to_hex(camera_id[camera])) for camera in rig.cameras
         )
         T_I_C = se3.compose(bodies.T_I_R[row], se3.inverse(T_C_R))
         sensors[name] = CameraRig(name, cameras, T_I_C)
@@ -219,7 +208,7 @@ def camera_poses(rig: ColmapRig, scale: float) -> F64:
     Raises:
         MapError: A camera has no pose.
     """
-    T_C_R = rig.T_C_R
+    T_C_R = rig.T_C_R.copy()
     if not np.all(np.isfinite(T_C_R)):
         raise MapError(
             f"rig {rig.id}: a camera has no pose on the rig: let COLMAP estimate it (rig_configurator)"
@@ -232,36 +221,27 @@ def _frames(
     model: ColmapModel,
     bodies: BodyFrames,
     times_ns: I64,
-    side: SideFile | None,
+    side: SideFile,
     rng: np.random.Generator,
 ) -> tuple[tables.Frames, I64]:
     """Return the frames, and the rows of their images."""
     vertex_of = np.full(len(model.frames.id), -1, dtype=np.int64)
     vertex_of[bodies.frame] = np.arange(len(bodies.frame))
-    image = _rows_of(model.images.id, model.frames.image_id)
-    vertex = vertex_of[model.frames.image_frame]
-    kept = (image >= 0) & (vertex >= 0)
-    image, vertex = image[kept], vertex[kept]
-    index_of = {number: k for rig in model.rigs for k, number in enumerate(rig.cameras)}
-    index = np.array([index_of[camera] for camera in model.images.camera[image].tolist()])
-    order = np.lexsort((index, vertex))
-    image, vertex, index = image[order], vertex[order], index[order]
+    vertex, index = vertex_of[model.images.frame], model.place_in_rig[model.images.camera]
+    image = np.lexsort((index, vertex))
+    vertex, index = vertex[image], index[image]
     twice = np.flatnonzero((vertex[1:] == vertex[:-1]) & (index[1:] == index[:-1]))
     if len(twice):
         name = model.images.name[image[twice[0] + 1]]
         raise MapError(f"image {name}: its frame has two images of the same camera")
     count = len(image)
-    ids, stamps = random_ids(count, rng), times_ns[image]
-    if side is not None:
-        rows = side_images(model, side)[image]
-        ids = _restored(ids, rows, side.image_frame_id)
-        stamps = np.where(rows >= 0, side.image_time_ns[rows], stamps)
+    rows = side_images(model, side)[image]
     table = tables.Frames.filled(
         count,
-        id=ids,
+        id=_restored(random_ids(count, rng), rows, side.image_frame_id),
         vertex=vertex,
         camera_index=index,
-        timestamp_ns=stamps,
+        timestamp_ns=picked(side.image_time_ns, rows, times_ns[image]),
         keypoint_count=model.images.keypoint_count[image],
         present=np.full(count, int(_PRESENT)),
         descriptor_blocks=no_blocks(count),
@@ -271,7 +251,7 @@ def _frames(
 
 def _landmarks(
     model: ColmapModel,
-    side: SideFile | None,
+    side: SideFile,
     frames: tables.Frames,
     keypoints: I64,
     p_G: F64,
@@ -279,36 +259,28 @@ def _landmarks(
     rng: np.random.Generator,
 ) -> tuple[tables.Landmarks, I64, int]:
     """Return landmarks in the order of point ids, rows (K,) of keypoints, and points left out."""
-    point = _rows_of(model.points.id, model.images.point[keypoints])
+    point = model.images.point[keypoints]
     observing = np.flatnonzero(point >= 0)
     vertex = np.repeat(frames.vertex, frames.keypoint_count)[observing]
-    order = np.argsort(model.points.id, kind="stable")
-    rank = np.empty(len(order), dtype=np.int64)
-    rank[order] = np.arange(len(order))
-    seen, first = np.unique(rank[point[observing]], return_index=True)
-    rows = order[seen]
+    rows, first = np.unique(point[observing], return_index=True)
     store = vertex[first]  # keypoints are in the order of vertices
     landmark = np.full(len(keypoints), -1, dtype=np.int64)
-    landmark[observing] = np.searchsorted(seen, rank[point[observing]])
-    ids = random_ids(len(rows), rng)
-    quality = np.full(len(rows), int(tables.LandmarkQuality.GOOD))
-    if side is not None:
-        known = _same_points(model, side, model.points.id[rows])
-        ids = _restored(ids, known, side.landmark_id)
-        quality = np.where(known >= 0, side.landmark_quality[known], quality)
+    landmark[observing] = np.searchsorted(rows, point[observing])
+    known = _same_points(model, side, model.points.id[rows])
+    good = np.full(len(rows), int(tables.LandmarkQuality.GOOD))
     table = tables.Landmarks.filled(
         len(rows),
-        id=ids,
+        id=_restored(random_ids(len(rows), rng), known, side.landmark_id),
         vertex=store,
         p_I=se3.transform(se3.inverse(T_G_I[store]), p_G[rows]),
-        quality=quality,
+        quality=picked(side.landmark_quality, known, good),
     )
     return table, landmark, len(model.points.id) - len(rows)
 
 
 def _same_points(model: ColmapModel, side: SideFile, ids: I64) -> I64:
     """Return the rows of the side file's points (L,) by id, -1 unless their observation is there."""
-    rows = _rows_of(side.point, ids)
+    rows = rows_of(side.point, ids)
     image_of_row = np.full(len(side.image_name), -1, dtype=np.int64)
     named = side_images(model, side)
     image_of_row[named[named >= 0]] = np.flatnonzero(named >= 0)
@@ -316,29 +288,26 @@ def _same_points(model: ColmapModel, side: SideFile, ids: I64) -> I64:
     keypoint = side.point_keypoint
     inside = (image >= 0) & (keypoint >= 0) & (keypoint < model.images.keypoint_count[image])
     place = np.where(inside, model.images.keypoint_start[image] + keypoint, 0)
-    same = inside & (model.images.point[place] == side.point)
-    return np.where((rows >= 0) & same[rows], rows, -1)
+    same = np.flatnonzero(inside & (model.point_id[place] == side.point))
+    return np.where(np.isin(rows, same), rows, -1)
 
 
 def _missions(
-    bodies: BodyFrames, side: SideFile | None, sensor_id: U64, rng: np.random.Generator
+    bodies: BodyFrames, side: SideFile, sensor_id: U64, rng: np.random.Generator
 ) -> tables.Missions:
     count = len(bodies.mission_rig)
     # the rows of a side file's mission that a model has put on two rigs: the first keeps the id
     rows, first = np.unique(bodies.mission_row, return_index=True)
     known = np.full(count, -1, dtype=np.int64)
     known[first[rows >= 0]] = rows[rows >= 0]
-    names = np.full(count, "", dtype=object)
-    if side is not None:
-        names[known >= 0] = side.mission_name[known[known >= 0]].tolist()
     return tables.Missions.filled(
         count,
-        id=_restored(random_ids(count, rng), known, None if side is None else side.mission_id),
+        id=_restored(random_ids(count, rng), known, side.mission_id),
         baseframe=np.arange(count),
         root_vertex=np.searchsorted(bodies.mission, np.arange(count)),
         backbone=np.full(count, int(tables.Backbone.ODOMETRY)),
         sensor_id=sensor_id,
-        name=names,
+        name=picked(side.mission_name, known, np.full(count, "", dtype=object)),
     )
 
 
@@ -359,10 +328,8 @@ def _edges(
     )
 
 
-def _restored(ids: U64, rows: I64, known: U64 | None) -> U64:
+def _restored(ids: U64, rows: I64, known: U64) -> U64:
     """Return ids (N, 2) with those of known rows (-1 = none), each used once."""
-    if known is None:
-        return ids
     taken, first = np.unique(rows, return_index=True)
     once = first[taken >= 0]
     restored = ids.copy()
@@ -370,18 +337,8 @@ def _restored(ids: U64, rows: I64, known: U64 | None) -> U64:
     return restored
 
 
-def _rows_of(ids: I64, wanted: I64) -> I64:
-    """Return the rows of wanted ids in a column of unique ids, -1 where they are not."""
-    if not len(ids):
-        return np.full(len(wanted), -1, dtype=np.int64)
-    order = np.argsort(ids, kind="stable")
-    place = np.minimum(np.searchsorted(ids[order], wanted), len(ids) - 1)
-    rows = order[place]
-    return np.where(ids[rows] == wanted, rows, -1).astype(np.int64)
-
-
 def _seed(model: ColmapModel, times_ns: I64) -> int:
     digest = hashlib.blake2b("\n".join(model.images.name).encode(), digest_size=16)
-    for column in (times_ns, model.images.T_C_W, model.images.uv, model.images.point):
+    for column in (times_ns, model.images.T_C_W, model.images.uv, model.point_id):
         digest.update(np.ascontiguousarray(column).tobytes())
     return int.from_bytes(digest.digest(), "little")

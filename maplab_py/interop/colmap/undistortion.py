@@ -34,8 +34,10 @@ def perspective_model(model: ColmapModel, folder: Path) -> ColmapModel:
             )
     new = {camera.id: _pinhole(camera) for camera in cameras}
     uv, point = images.uv.copy(), images.point.copy()
-    for camera in cameras:
-        mine = ragged_rows(images.keypoint_start, np.flatnonzero(images.camera == camera.id))
+    for row, camera in enumerate(model.cameras):
+        if has_model(camera):
+            continue
+        mine = ragged_rows(images.keypoint_start, np.flatnonzero(images.camera == row))
         rays = pycolmap_files.rays_of(camera, uv[mine])
         seen: Mask = np.asarray(np.isfinite(rays).all(axis=1))
         seen &= np.linalg.norm(np.where(seen[:, None], rays, 0.0), axis=1) < _LARGEST_TANGENT

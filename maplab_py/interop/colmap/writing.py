@@ -33,38 +33,38 @@ def _encode_cameras(model: colmap.ColmapModel) -> Iterator[bytes]:
 def _encode_rigs(model: colmap.ColmapModel) -> Iterator[bytes]:
     yield struct.pack("<Q", len(model.rigs))
     for rig in model.rigs:
-        yield struct.pack("<II", rig.id, len(rig.sensors))
-        for row, sensor in enumerate(rig.sensors):
-            yield struct.pack("<iI", *sensor)
-            if row:
-                yield b"\x01" + _doubles(rig.T_S_R[row, _TO_FILE])
+        yield struct.pack("<II", rig.id, len(rig.cameras))
+        for place, camera in enumerate(rig.cameras):
+            yield struct.pack("<iI", colmap.CAMERA_SENSOR, model.cameras[camera].id)
+            if place:
+                yield b"\x01" + _doubles(rig.T_C_R[place, _TO_FILE])
 
 
 def _encode_frames(model: colmap.ColmapModel) -> Iterator[bytes]:
-    frames = model.frames
-    order = np.argsort(frames.image_frame, kind="stable")
-    images = frames.image_id[order]
-    start = starts_of_counts(np.bincount(frames.image_frame, minlength=len(frames.id)))
-    row_of_image = {image: row for row, image in enumerate(model.images.id.tolist())}
+    frames, images = model.frames, model.images
+    order = np.argsort(images.frame, kind="stable")
+    start = starts_of_counts(np.bincount(images.frame, minlength=len(frames.id)))
     yield struct.pack("<Q", len(frames.id))
     for row, (number, rig) in enumerate(zip(frames.id.tolist(), frames.rig.tolist(), strict=True)):
-        mine = images[start[row] : start[row + 1]].tolist()
-        yield struct.pack("<II", number, rig) + _doubles(frames.T_R_W[row, _TO_FILE])
+        mine = order[start[row] : start[row + 1]]
+        yield struct.pack("<II", number, model.rigs[rig].id) + _doubles(frames.T_R_W[row, _TO_FILE])
         yield struct.pack("<I", len(mine))
-        for image in mine:
-            camera = int(model.images.camera[row_of_image[image]])
-            yield struct.pack("<iIQ", colmap.SensorType.CAMERA, camera, image)
+        for camera, image in zip(
+            images.camera[mine].tolist(), images.id[mine].tolist(), strict=True
+        ):
+            yield struct.pack("<iIQ", colmap.CAMERA_SENSOR, model.cameras[camera].id, image)
 
 
 def _encode_images(model: colmap.ColmapModel) -> Iterator[bytes]:
     images = model.images
     keypoints = np.zeros(len(images.uv), dtype=colmap.KEYPOINT)
-    keypoints["uv"], keypoints["point"] = images.uv, images.point
+    keypoints["uv"], keypoints["point"] = images.uv, model.point_id
     start = images.keypoint_start.tolist()
     yield struct.pack("<Q", len(images.id))
     for row, name in enumerate(images.name):
+        camera = model.cameras[int(images.camera[row])]
         yield struct.pack("<I", int(images.id[row])) + _doubles(images.T_C_W[row, _TO_FILE])
-        yield struct.pack("<I", int(images.camera[row])) + name.encode() + b"\0"
+        yield struct.pack("<I", camera.id) + name.encode() + b"\0"
         yield struct.pack("<Q", start[row + 1] - start[row])
         yield keypoints[start[row] : start[row + 1]].tobytes()
 
@@ -72,8 +72,7 @@ def _encode_images(model: colmap.ColmapModel) -> Iterator[bytes]:
 def _encode_points(model: colmap.ColmapModel) -> Iterator[bytes]:
     points, images = model.points, model.images
     observing = np.flatnonzero(images.point >= 0)
-    order = np.argsort(points.id, kind="stable")
-    row = order[np.searchsorted(points.id[order], images.point[observing])]
+    row = images.point[observing]
     length = np.bincount(row, minlength=len(points.id))
     observing = observing[np.argsort(row, kind="stable")]
     records = np.zeros(len(points.id), dtype=colmap.POINT)

@@ -87,7 +87,8 @@ def _twice_named(model: ColmapModel) -> ColmapModel:
 
 
 def _unknown_camera(model: ColmapModel) -> ColmapModel:
-    return _with_images(model, camera=np.full(len(model.images.id), 99))
+    cameras = tuple(dataclasses.replace(camera, id=99) for camera in model.cameras)
+    return dataclasses.replace(model, cameras=cameras)
 
 
 def _not_finite(model: ColmapModel) -> ColmapModel:
@@ -126,6 +127,8 @@ def test_what_does_not_fit_is_named(
 ) -> None:
     for name, content in binary_files(damage(model)).items():
         (tmp_path / name).write_bytes(b"".join(content))
+    if damage is _unknown_camera:
+        (tmp_path / "cameras.bin").write_bytes(b"".join(binary_files(model)["cameras.bin"]))
     with pytest.raises(MapError, match=reason) as error:
         import_colmap(tmp_path)
     assert str(tmp_path) in one_line(error)

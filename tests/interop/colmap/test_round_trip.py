@@ -130,8 +130,7 @@ def test_a_refined_model_keeps_the_ids_that_still_apply(tmp_path: Path) -> None:
     export_colmap(vi_map, tmp_path, EVERYTHING)
     exported = model_of_map(vi_map, quality="all").model
     point = exported.images.point.copy()
-    lost = int(exported.points.id[0])
-    point[point == lost] = -1  # what COLMAP does when it filters a point
+    point[point == 0] = -1  # what COLMAP does when it filters a point
     shutil.copy(tmp_path / FILE_NAME, tmp_path / "kept")
     filtered = dataclasses.replace(
         exported, images=dataclasses.replace(exported.images, point=point)
