@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from maplab_py.array_types import F64, I32, U8
+from maplab_py.array_types import F32, F64, I32, U8
 from maplab_py.errors import MapError, UserError
 from maplab_py.input_files import DEFAULT_MAX_BYTES, read_bytes
 from maplab_py.interop.ply import PlyCloud, encode_ply, parse_ply
@@ -92,3 +92,31 @@ def _encoded(kind: str, p: F64, faces: I32, colours: U8 | None) -> list[bytes]:
     mesh = trimesh.Trimesh(p, faces, vertex_colors=colours, process=False, validate=False)
     content = mesh.export(file_type=kind[1:])
     return [content.encode() if isinstance(content, str) else bytes(content)]
+
+
+def shown_glb(p: F32, faces: I32, linear: F64, opacity: float) -> bytes:
+    """Return a GLB file for a page that shows it as it is: z up, matt and visible from both sides.
+
+    Args:
+        p: Vertices (N, 3).
+        faces: Triangles (F, 3).
+        linear: Colours (N, 3) of the vertices, linear light from 0 to 1.
+        opacity: From 0 to 1.
+    """
+    import trimesh as library
+
+    trimesh: Any = library
+    material = trimesh.visual.material.PBRMaterial(
+        metallicFactor=0.0, roughnessFactor=1.0, baseColorFactor=[1.0, 1.0, 1.0, opacity],
+        doubleSided=True, alphaMode="BLEND" if opacity < 1.0 else "OPAQUE",
+    )  # fmt: skip
+    mesh = trimesh.Trimesh(
+        p, faces, visual=trimesh.visual.TextureVisuals(material=material),
+        vertex_attributes={"_COLOR_0": linear}, process=False, validate=False,
+    )  # fmt: skip
+
+    def name_colours(tree: Any) -> None:  # those of trimesh have 8 bits, which dark ones share
+        attributes = tree["meshes"][0]["primitives"][0]["attributes"]
+        attributes["COLOR_0"] = attributes.pop("_COLOR_0")
+
+    return bytes(trimesh.exchange.gltf.export_glb(mesh, tree_postprocessor=name_colours))

@@ -12,7 +12,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.array_types import F32, F64, I64, U8
+from maplab_py.array_types import F32, F64, I64, U8, Rows
 from maplab_py.viewer import colours as palettes
 
 WHOLE_MAP = ""
@@ -30,7 +30,7 @@ class Entity(Enum):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Points:
+class Points(Rows):
     """A cloud."""
 
     p: F32  # (N, 3) [m]
@@ -39,12 +39,9 @@ class Points:
     size_m: float
     labels: tuple[str, ...] = ()  # one for each of the first points; empty = no label
 
-    def __len__(self) -> int:
-        return len(self.p)
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Segments:
+class Segments(Rows):
     """Straight lines."""
 
     ends: F32  # (N, 2, 3) [m]
@@ -52,20 +49,14 @@ class Segments:
     rows: I64  # (N,) rows of the map's table
     width_px: float = 1.5
 
-    def __len__(self) -> int:
-        return len(self.ends)
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Axes:
+class Axes(Rows):
     """Coordinate frames with a name each."""
 
     T: F64  # (N, 7), relative to the scene's origin
     length_m: float
     labels: tuple[str, ...] = ()
-
-    def __len__(self) -> int:
-        return len(self.T)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

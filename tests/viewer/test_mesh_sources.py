@@ -1,6 +1,7 @@
 """Colours of meshes by every rule, slices of distance fields, files of meshes."""
 
 import io
+import json
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +9,11 @@ import pytest
 
 from maplab_py.algorithms.dense.field import FIELD_TYPE, DistanceField, encode_field
 from maplab_py.errors import UserError
+from maplab_py.interop.mesh_files import shown_glb
 from maplab_py.storage.resources.new import NewResources
 from maplab_py.viewer import colours
-from maplab_py.viewer.display.parts import coloured_glb, is_coloured
+from maplab_py.viewer.colours import linear_light
+from maplab_py.viewer.display.parts import is_coloured
 from maplab_py.viewer.layers.clouds import Cloud
 from maplab_py.viewer.mesh_sources import coloured_mesh, field_slice
 from maplab_py.viewer.resource_clouds import VertexImages, depth_picture
@@ -128,11 +131,17 @@ def test_a_reader_sees_corners_triangles_and_colours() -> None:
     colours = np.array([[0, 0, 0], [255, 255, 255], [255, 0, 0], [0, 188, 0]] + 3 * [[5, 5, 5]])
     mesh = Mesh(p, faces, colours.astype(np.uint8))
     assert is_coloured(mesh)
-    data = coloured_glb(mesh)
+    data = shown_glb(p, faces, linear_light(mesh.colours), 1.0)
     read = trimesh.load(io.BytesIO(data), file_type="glb", force="mesh", process=False)
     np.testing.assert_array_equal(read.vertices.astype(np.float32), p)
     np.testing.assert_array_equal(read.faces, faces)
-    assert len(data) % 4 == 0
+    length = int.from_bytes(data[12:16], "little")
+    content = json.loads(data[20 : 20 + length])
+    accessor = content["accessors"][content["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
+    start = 28 + length + content["bufferViews"][accessor["bufferView"]]["byteOffset"]
+    linear = np.frombuffer(data, "<f4", 21, start).reshape(7, 3)
+    np.testing.assert_allclose(linear[3], [0.0, 0.5029, 0.0], atol=1e-4)
+    np.testing.assert_allclose(linear[4:], 5.0 / 255.0 / 12.92, rtol=1e-5)  # 8 bits cannot say this
 
 
 def test_a_mesh_of_one_colour_is_none() -> None:

@@ -1,6 +1,7 @@
 """Another map, or another state of the map, beside the map: one camera looks at both."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from maplab_py.viewer.drawing import (
 )
 from maplab_py.viewer.layers.landmarks import landmarks, point_size
 from maplab_py.viewer.layers.paths import trajectories
-from maplab_py.viewer.scene import WHOLE_MAP, Layer, Part, Points, Segments
+from maplab_py.viewer.scene import WHOLE_MAP, Layer, Part
 from maplab_py.vimap import LandmarkQuality, VIMap, to_hex_list
 
 _GAP = 0.15
@@ -39,19 +40,8 @@ def swiped(drawing: Drawing, other: VIMap) -> list[Layer]:
 
 def _joined(layer: Layer) -> dict[str, Part]:
     """Return the parts of all missions, which the map need not have, as one."""
-    clouds = [part for part in layer.parts.values() if isinstance(part, Points)]
-    lines = [part for part in layer.parts.values() if isinstance(part, Segments)]
-    colour, rows = ([getattr(p, name) for p in clouds + lines] for name in ("colours", "rows"))
-    if clouds:
-        p = np.concatenate([part.p for part in clouds])
-        return {
-            WHOLE_MAP: Points(p, np.concatenate(colour), np.concatenate(rows), clouds[0].size_m)
-        }
-    if lines:
-        ends = np.concatenate([part.ends for part in lines])
-        width = lines[0].width_px
-        return {WHOLE_MAP: Segments(ends, np.concatenate(colour), np.concatenate(rows), width)}
-    return {}
+    parts: list[Any] = list(layer.parts.values())
+    return {WHOLE_MAP: type(parts[0]).concatenate(parts)} if parts else {}
 
 
 def beside(drawing: Drawing, other: VIMap, names: tuple[str, str]) -> list[Layer]:

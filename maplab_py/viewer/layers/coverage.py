@@ -140,8 +140,10 @@ class SeenVolume:
     @property
     def is_foggy(self) -> Mask:
         """Tell which voxels (X, Y, Z) are seen through from too few sides, or border on the others."""
+        from scipy.ndimage import binary_dilation
+
         is_seen = self.directions >= _WELL_SEEN
-        return ~is_seen & ((self.directions > 0) | _grown(is_seen))
+        return np.asarray(~is_seen & ((self.directions > 0) | binary_dilation(is_seen)))
 
     def centres(self, cells: I64) -> F64:
         """Return the centres (N, 3) of voxels (N, 3)."""
@@ -188,16 +190,6 @@ def _crossings(start: F64, end: F64, low: F64, cell: float, shape: I64) -> NDArr
         np.bitwise_or.at(seen, flat, bit[reached][inside])
     counts = sum((seen >> k) & 1 for k in range(_DIRECTIONS))
     return np.asarray(counts, dtype=np.uint8).reshape(tuple(shape.tolist()))
-
-
-def _grown(mask: Mask) -> Mask:
-    """Return a mask (X, Y, Z) with the neighbours of its voxels."""
-    padded = np.pad(mask, 1)
-    grown = mask.copy()
-    for axis in range(3):
-        for shift in (-1, 1):
-            grown |= np.roll(padded, shift, axis=axis)[1:-1, 1:-1, 1:-1]
-    return grown
 
 
 def _fog(drawing: Drawing, volume: SeenVolume) -> Layer:
