@@ -206,19 +206,12 @@ def _with_clutter(
     total = int(extra.sum())
     size = np.array([camera.width_px - 1, camera.height_px - 1])
     uv = rng.uniform(size=(total, 2)) * size
-    none = np.full(total, -1, dtype=np.int64)
-    frame = np.concatenate([detections.frame, np.repeat(np.arange(frames), extra)])
-    order = np.argsort(frame, kind="stable")
-    return Detections(
-        frame[order],
-        np.concatenate([detections.point, none])[order],
-        np.concatenate([detections.track, none])[order],
-        np.concatenate([detections.uv_true_px, uv])[order],
-        np.concatenate([np.clip(detections.uv_px, 0.0, size), uv])[order],
-        np.concatenate([detections.view_G, np.zeros((total, 3))])[order],
-        np.concatenate([detections.distance_m, np.ones(total)])[order],
-        np.concatenate([detections.octave, np.zeros(total, dtype=np.int64)])[order],
-    )
+    none, frame = np.full(total, -1, dtype=np.int64), np.repeat(np.arange(frames), extra)
+    distance, octave = np.ones(total), np.zeros(total, dtype=np.int64)
+    clutter = Detections(frame, none, none, uv, uv, np.zeros((total, 3)), distance, octave)
+    real = dataclasses.replace(detections, uv_px=np.clip(detections.uv_px, 0.0, size))
+    every = Detections.concatenate([real, clutter])
+    return every.take(np.argsort(every.frame, kind="stable"))
 
 
 _SWAP_CANDIDATES = 8

@@ -11,7 +11,7 @@ import numpy as np
 from maplab_py.array_types import F32, F64, U8
 from maplab_py.compilation import compiled
 from maplab_py.errors import UserError
-from maplab_py.sensors import Camera
+from maplab_py.sensors import Camera, projection
 from maplab_py.simulation.cameras import pixels_of
 from maplab_py.simulation.ray_caster import RayCaster
 from maplab_py.simulation.scenario import ImageOptions, SessionImages
@@ -90,7 +90,7 @@ def _expose(light, vignette, gain, noise, sigma, image):  # type: ignore[no-unty
             image[row, column] = np.uint8(np.float32(255.0) if value > np.float32(255.0) else value)
 
 
-_NEWTON_ROUNDS = 30
+_MAX_MISS_PX = 1e-6
 _LARGEST_RADIUS = 5.0
 """Pixels with a larger angle to the optical axis (79 deg) are black."""
 
@@ -98,46 +98,22 @@ _LARGEST_RADIUS = 5.0
 def pixel_rays(camera: Camera) -> F64:
     """Return the points (H, W, 2) on the plane z = 1 that the pixel centres show; NaN = none.
 
-    The projection is inverted by Newton's method with numeric derivatives.
+    The camera model's inverse counts where the simulator's projection confirms it.
 
     Raises:
         UserError: No pixel has a ray.
     """
     v, u = np.mgrid[0 : camera.height_px, 0 : camera.width_px].astype(np.float64)
-    wanted = np.stack([u.ravel(), v.ravel()], axis=1)
-    offset = (wanted - camera.intrinsics[-2:]) / camera.central_focal_px
-    # starts near the centre, where all models are nearly linear, and proceeds outwards
-    x = offset / (1.0 + 0.3 * np.sum(offset**2, axis=1, keepdims=True))
-    step = 1e-6
-    step_u, step_v = np.array([step, 0.0]), np.array([0.0, step])
-    for _ in range(_NEWTON_ROUNDS):
-        here = _project(camera, x)
-        miss = wanted - here
-        if np.abs(miss).max() < 1e-9:
-            break
-        du = (_project(camera, x + step_u) - here) / step
-        dv = (_project(camera, x + step_v) - here) / step
-        determinant = du[:, 0] * dv[:, 1] - du[:, 1] * dv[:, 0]
-        determinant = np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
-        move = np.stack(
-            [
-                (miss[:, 0] * dv[:, 1] - miss[:, 1] * dv[:, 0]) / determinant,
-                (miss[:, 1] * du[:, 0] - miss[:, 0] * du[:, 1]) / determinant,
-            ],
-            axis=1,
-        )
-        length = np.linalg.norm(move, axis=1, keepdims=True)
-        x = x + move * np.minimum(1.0, 0.5 / np.maximum(length, 1e-12))
-    lost = np.linalg.norm(_project(camera, x) - wanted, axis=1) > 1e-6
-    lost |= np.linalg.norm(x, axis=1) > _LARGEST_RADIUS
-    if lost.all():
+    uv = np.stack([u.ravel(), v.ravel()], axis=1)
+    rays, valid = projection.back_project(camera, uv)
+    x = rays[:, :2] / np.where(valid & (rays[:, 2] > 0.0), rays[:, 2], np.nan)[:, None]
+    again = pixels_of(camera, np.concatenate([x, np.ones((len(x), 1))], axis=1))
+    is_known = np.linalg.norm(again - uv, axis=1) < _MAX_MISS_PX
+    is_known &= np.linalg.norm(x, axis=1) <= _LARGEST_RADIUS
+    if not is_known.any():
         raise UserError("cameras: no pixel of the image can be inverted to a ray")
-    x[lost] = np.nan
+    x[~is_known] = np.nan
     return np.asarray(x.reshape(camera.height_px, camera.width_px, 2))
-
-
-def _project(camera: Camera, x: F64) -> F64:
-    return pixels_of(camera, np.concatenate([x, np.ones((len(x), 1))], axis=1))
 
 
 _GAIN_PERIOD_S = 7.0

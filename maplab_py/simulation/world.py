@@ -58,14 +58,14 @@ def _with_moving_objects(world: World, options: WorldOptions, rng: np.random.Gen
         count, options.landmarks_per_object, options.object_speed_mps, world.bounds, rng
     )
     first = int(world.look.max(initial=-1)) + 1
-    return World(
-        np.concatenate([world.p_G, p_G]),
-        np.concatenate([world.normal_G, normal_G]),
-        np.concatenate([world.look, first + np.arange(len(p_G))]),
-        world.boxes,
-        world.bounds,
-        np.concatenate([world.moving, np.repeat(np.arange(count), options.landmarks_per_object)]),
-        objects,
+    carrier = np.repeat(np.arange(count), options.landmarks_per_object)
+    return dataclasses.replace(
+        world,
+        p_G=np.concatenate([world.p_G, p_G]),
+        normal_G=np.concatenate([world.normal_G, normal_G]),
+        look=np.concatenate([world.look, first + np.arange(len(p_G))]),
+        moving=np.concatenate([world.moving, carrier]),
+        objects=objects,
     )
 
 
@@ -261,16 +261,7 @@ def _floor_surfaces(options: WorldOptions, block: F64, z_m: float) -> Surfaces:
     inner = box_surfaces(
         np.append(block[0, :2], low[2]), np.append(block[1, :2], high[2]), inwards=False
     )
-    return Surfaces.concatenate([outer, _first(inner, 4)])
-
-
-def _first(surfaces: Surfaces, count: int) -> Surfaces:
-    return Surfaces(
-        surfaces.corner[:count],
-        surfaces.side_u[:count],
-        surfaces.side_v[:count],
-        surfaces.normal[:count],
-    )
+    return Surfaces.concatenate([outer, inner.take(np.arange(4))])
 
 
 def _in_block(p: F64, block: F64) -> NDArray[np.bool_]:
