@@ -125,33 +125,16 @@ def without_edges(depth: F32, margin_px: int) -> F32:
 
 
 def _opencv_matcher(options: SgbmOptions | BmOptions) -> Any:
+    """Return OpenCV's matcher; its setters have the names of the options in camel case."""
     import cv2
 
-    if isinstance(options, SgbmOptions):
-        return cv2.StereoSGBM.create(
-            options.min_disparity,
-            options.num_disparities,
-            options.sad_window_size,
-            options.p1,
-            options.p2,
-            options.disp12_max_diff,
-            options.pre_filter_cap,
-            options.uniqueness_ratio,
-            options.speckle_window_size,
-            options.speckle_range,
-            options.mode,
-        )
-    matcher = cv2.StereoBM.create(options.num_disparities, options.sad_window_size)
-    matcher.setMinDisparity(options.min_disparity)
-    matcher.setDisp12MaxDiff(options.disp12_max_diff)
-    matcher.setPreFilterCap(options.pre_filter_cap)
-    matcher.setPreFilterSize(options.pre_filter_size)
-    is_sobel = options.prefilter_type == "xsobel"
-    matcher.setPreFilterType(
-        cv2.StereoBM_PREFILTER_XSOBEL if is_sobel else cv2.StereoBM_PREFILTER_NORMALIZED_RESPONSE
-    )
-    matcher.setTextureThreshold(options.texture_threshold)
-    matcher.setUniquenessRatio(options.uniqueness_ratio)
-    matcher.setSpeckleWindowSize(options.speckle_window_size)
-    matcher.setSpeckleRange(options.speckle_range)
+    is_sobel = isinstance(options, BmOptions) and options.prefilter_type == "xsobel"
+    values = dataclasses.asdict(options)
+    values["block_size"] = values.pop("sad_window_size")
+    if values.pop("prefilter_type", None) is not None:
+        response = cv2.StereoBM_PREFILTER_NORMALIZED_RESPONSE
+        values["pre_filter_type"] = cv2.StereoBM_PREFILTER_XSOBEL if is_sobel else response
+    matcher = (cv2.StereoBM if isinstance(options, BmOptions) else cv2.StereoSGBM).create()
+    for name, value in values.items():
+        getattr(matcher, "set" + "".join(map(str.capitalize, name.split("_"))))(value)
     return matcher

@@ -12,7 +12,7 @@ import numpy as np
 from maplab_py.algorithms.dense import pinhole as pinholes
 from maplab_py.algorithms.dense.resources import IMAGES, FrameImages, FrameResources, check_size
 from maplab_py.algorithms.landmarks.quality import evaluate_unknown_quality
-from maplab_py.array_types import F64, I64, U8
+from maplab_py.array_types import F64, I64
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3
 from maplab_py.interop import mvs
@@ -58,13 +58,11 @@ def write_colmap_workspace(
     """
     names = [_colmap_name(views, view) for view in range(len(views))]
     check_writable(folder / "sparse" / "cameras.bin", overwrite=overwrite)
-    tracks, scene = _scene(views, names, only_good=only_good)
-    colours = np.full((len(scene.p_G), 3), _GREY, dtype=np.uint8)
+    scene = views.scene(names, only_good=only_good)
     for view, image in _images(views, progress):
         write_bytes(folder / "images" / names[view], [_encode(image, ".png")], overwrite=overwrite)
-        _paint(colours, image, tracks, view)
-    model = mvs.encode_model(dataclasses.replace(scene, colours=colours))
-    for name, content in model.items():
+        _paint(scene, image, view)
+    for name, content in mvs.encode_model(scene).items():
         write_bytes(folder / "sparse" / name, [content], overwrite=overwrite)
     settings = (f"{name}\n__auto__, {_SOURCES}\n" for name in names)
     write_text(folder / "stereo" / "patch-match.cfg", settings, overwrite=overwrite)
@@ -97,15 +95,13 @@ def write_pmvs_folder(
         raise UserError(f"--pmvs_image_format={image_format}: choose one of {known}")
     check_writable(folder / "bundle.rd.out", overwrite=overwrite)
     names = [mvs.file_number(view) + suffix for view in range(len(views))]
-    tracks, scene = _scene(views, names, only_good=only_good)
-    colours = np.full((len(scene.p_G), 3), _GREY, dtype=np.uint8)
+    scene = views.scene(names, only_good=only_good)
     for view, image in _images(views, progress):
         content = _encode(_three_channels(image), suffix)
         write_bytes(folder / "visualize" / names[view], [content], overwrite=overwrite)
         matrix = folder / "txt" / f"{mvs.file_number(view)}.txt"
         write_text(matrix, [mvs.projection_text(scene, view)], overwrite=overwrite)
-        _paint(colours, image, tracks, view)
-    scene = dataclasses.replace(scene, colours=colours)
+        _paint(scene, image, view)
     for name, text in (
         ("list.rd.txt", mvs.list_text(names)),
         ("option-all", mvs.option_text(len(names))),
@@ -114,28 +110,6 @@ def write_pmvs_folder(
         write_text(folder / name, [text], overwrite=overwrite)
     _keep(folder / "models", overwrite=overwrite)
     return _report(folder, views, scene)
-
-
-def _scene(
-    views: UndistortedViews, names: list[str], *, only_good: bool
-) -> tuple[PointTracks, mvs.MvsScene]:
-    tracks = views.tracks(only_good=only_good)
-    size = [[p.width_px, p.height_px] for p in views.pinholes]
-    K = [[p.focal_px, p.focal_px, *p.centre_px] for p in views.pinholes]
-    scene = mvs.MvsScene(
-        np.array(size, dtype=np.int64),
-        np.array(K),
-        views.camera_of_view,
-        names,
-        views.T_C_G,
-        tracks.p_G,
-        np.full((len(tracks.p_G), 3), _GREY, dtype=np.uint8),
-        tracks.landmark,
-        tracks.view,
-        tracks.uv_px,
-        np.zeros(len(tracks.p_G)),
-    )
-    return tracks, dataclasses.replace(scene, error_px=_errors_px(scene))
 
 
 def _errors_px(scene: mvs.MvsScene) -> F64:
@@ -154,11 +128,11 @@ def _images(views: UndistortedViews, progress: Progress) -> Iterator[tuple[int, 
         yield view, views.image(view)
 
 
-def _paint(colours: U8, image: Any, tracks: PointTracks, view: int) -> None:
+def _paint(scene: mvs.MvsScene, image: Any, view: int) -> None:
     """Give the points that an image shows the colours of their pixels."""
-    rows = np.flatnonzero(tracks.view == view)
-    u, v = np.round(tracks.uv_px[rows]).astype(np.int64).T
-    colours[tracks.landmark[rows]] = _three_channels(image)[v, u, ::-1]
+    rows = np.flatnonzero(scene.view == view)
+    u, v = np.round(scene.uv_px[rows]).astype(np.int64).T
+    scene.colours[scene.landmark[rows]] = _three_channels(image)[v, u, ::-1]
 
 
 def _three_channels(image: Any) -> Any:
@@ -204,16 +178,6 @@ class UndistortionOptions:
     alpha: float = 0.0  # 0 = valid pixels only, 1 = all pixels of the recorded image
     scale: float = 1.0
     max_size_px: int = 0  # of the longer side; 0 = no limit
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class PointTracks:
-    """Landmarks and where they appear in the V exported images."""
-
-    p_G: F64  # (L, 3)
-    landmark: I64  # (O,) row of p_G
-    view: I64  # (O,) row of the view
-    uv_px: F64  # (O, 2) in the undistorted image, pixel centres at whole numbers
 
 
 class UndistortedViews:
@@ -270,13 +234,16 @@ class UndistortedViews:
         check_size(name, image, self.cameras[camera])
         return self._maps[camera].image(image)
 
-    def tracks(self, *, only_good: bool = True, progress: Progress = SILENT) -> PointTracks:
-        """Return the landmarks that the views observe, at least two each, and their observations.
+    def scene(self, names: list[str], *, only_good: bool = True) -> mvs.MvsScene:
+        """Return the views, and the landmarks that they observe, at least two each, still grey.
 
         Observations outside an undistorted image are left out. The quality of landmarks is evaluated where
         it is unknown.
+
+        Args:
+            names: Files (V,) of the images.
         """
-        vi_map = evaluate_unknown_quality(self.vi_map, progress)[0] if only_good else self.vi_map
+        vi_map = evaluate_unknown_quality(self.vi_map, SILENT)[0] if only_good else self.vi_map
         view_of_frame = np.full(len(vi_map.frames), -1, dtype=np.int64)
         view_of_frame[self.frames] = np.arange(len(self.frames))
         view = view_of_frame[vi_map.keypoint_frame]
@@ -292,7 +259,20 @@ class UndistortedViews:
         often = count[landmark[rows]] >= 2
         rows, uv = rows[often], uv[often]
         kept, number = np.unique(landmark[rows], return_inverse=True)
-        return PointTracks(vi_map.p_G[kept], number.reshape(-1), view[rows], uv)
+        scene = mvs.MvsScene(
+            np.array([[p.width_px, p.height_px] for p in self.pinholes], dtype=np.int64),
+            np.array([[p.focal_px, p.focal_px, *p.centre_px] for p in self.pinholes]),
+            self.camera_of_view,
+            names,
+            self.T_C_G,
+            vi_map.p_G[kept],
+            np.full((len(kept), 3), _GREY, dtype=np.uint8),
+            number.reshape(-1),
+            view[rows],
+            uv,
+            np.zeros(len(kept)),
+        )
+        return dataclasses.replace(scene, error_px=_errors_px(scene))
 
     def _undistort(self, view: I64, uv_px: F64) -> tuple[F64, Any]:
         """Return keypoints (N, 2) in the undistorted images, and which are inside."""
