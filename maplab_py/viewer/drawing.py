@@ -205,26 +205,16 @@ def _finite(p: F64) -> F64:
 def make_points(p: F64, colour: U8, rows: I64, size_m: float) -> Points:
     """Return a cloud of points (N, 3) in one colour (3,) or one each (N, 3), finite ones only."""
     every = np.broadcast_to(colour, (len(p), 3))
-    keep = np.isfinite(p).all(axis=1)
-    return Points(
-        np.ascontiguousarray(p[keep], dtype=np.float32),
-        np.ascontiguousarray(every[keep]),
-        np.asarray(rows[keep], dtype=np.int64),
-        size_m,
-    )
+    points = Points(p.astype(np.float32), every, rows.astype(np.int64), size_m)
+    return points.take(np.flatnonzero(np.isfinite(p).all(axis=1)))
 
 
 def make_segments(start: F64, end: F64, colour: U8, rows: I64, width_px: float = 1.5) -> Segments:
     """Return lines from (N, 3) to (N, 3) in one colour (3,) or one each (N, 3), finite ones only."""
     ends = np.stack([start, end], axis=1)
     every = np.broadcast_to(colour, (len(ends), 3))
-    keep = np.isfinite(ends).all(axis=(1, 2))
-    return Segments(
-        np.ascontiguousarray(ends[keep], dtype=np.float32),
-        np.ascontiguousarray(every[keep]),
-        np.asarray(rows[keep], dtype=np.int64),
-        width_px,
-    )
+    segments = Segments(ends.astype(np.float32), every, rows.astype(np.int64), width_px)
+    return segments.take(np.flatnonzero(np.isfinite(ends).all(axis=(1, 2))))
 
 
 def axis_lines(T: F64, rows: I64, length_m: float, width_px: float = 2.0) -> Segments:

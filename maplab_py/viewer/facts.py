@@ -25,19 +25,6 @@ def _short(id_: IdArray) -> str:
     return to_hex(id_)[:ID_DIGITS]
 
 
-def facts(vi_map: VIMap, entity: Entity, row: int) -> Facts:
-    """Return what is known of an entity of a map."""
-    if entity is Entity.VERTEX:
-        return vertex_facts(vi_map, row)
-    if entity is Entity.LANDMARK:
-        return landmark_facts(vi_map, row)
-    if entity is Entity.LOOP_CLOSURE:
-        return loop_closure_facts(vi_map, row)
-    if entity is Entity.CLOSURE:
-        return closure_facts(vi_map, row)
-    return ()
-
-
 def vertex_facts(vi_map: VIMap, row: int) -> Facts:
     """Return id, time, state and observations of a vertex."""
     vertex = vi_map.vertex(row)
@@ -204,3 +191,16 @@ def _range_text_m(values: F64) -> str:
     if not len(values):
         return "-"
     return f"{values.min():.2f} to {values.max():.2f} m"
+
+
+_OF_ENTITY = {
+    Entity.VERTEX: vertex_facts,
+    Entity.LANDMARK: landmark_facts,
+    Entity.LOOP_CLOSURE: loop_closure_facts,
+    Entity.CLOSURE: closure_facts,
+}
+
+
+def facts(vi_map: VIMap, entity: Entity, row: int) -> Facts:
+    """Return what is known of an entity of a map."""
+    return _OF_ENTITY[entity](vi_map, row) if entity in _OF_ENTITY else ()

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from maplab_py.algorithms.landmarks.sightings import residuals
-from maplab_py.array_types import F64, I64, U8
+from maplab_py.array_types import F64, I64, U8, Rows
 from maplab_py.errors import MapError, UserError
 from maplab_py.viewer import colours, resource_clouds
 from maplab_py.viewer.display import panel, parts
@@ -368,15 +368,12 @@ _GAP_PX = 6
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Matches:
+class Matches(Rows):
     """Keypoints of two images that show the same point."""
 
     first: I64  # (N,) rows
     second: I64  # (N,)
     are_landmarks: bool  # both observe one landmark; else their descriptors are alike
-
-    def __len__(self) -> int:
-        return len(self.first)
 
     @property
     def note(self) -> str:
