@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from maplab_py.options import option
+from maplab_py.sensors import Distortion, Projection
 
 PATH_KINDS = ("room_scan", "figure_8", "loop", "corridor", "vehicle", "streets")
 """Motions along a path of the world; other motions start at the current pose."""
@@ -31,7 +32,7 @@ class WorldOptions:
     of streets between blocks of houses.
     """
 
-    layout: str = "rooms"  # or corridor, city
+    layout: str = option("rooms", choices=LAYOUTS)
     rooms: int = option(1, gt=0)
     corridor_rooms: tuple[int, ...] = ()  # are corridors with an appearance of their own
     floors: int = option(1, gt=0)  # of a corridor
@@ -83,9 +84,8 @@ class ImuOptions:
 class CameraOptions:
     """One camera of the rig, looking along the body's x axis before it is turned."""
 
-    projection: str = "pinhole"  # unified-projection, double-sphere, extended-unified
-    # none, radial-tangential-5, rational-polynomial, equidistant, fisheye (= FOV)
-    distortion: str = "radial-tangential"
+    projection: str = option("pinhole", choices=[kind.value for kind in Projection])
+    distortion: str = option("radial-tangential", choices=[kind.value for kind in Distortion])
     intrinsics: tuple[float, ...] = (380.0, 380.0, 376.0, 240.0)
     distortion_parameters: tuple[float, ...] = (-0.28, 0.07, 2e-4, 2e-5)
     width_px: int = option(752, ge=16)
@@ -252,7 +252,7 @@ class MotionOptions:
     (constant velocity), `rotation` (position kept), `stationary`, `hover`, `shake`.
     """
 
-    kind: str = "room_scan"
+    kind: str = option("room_scan", choices=MOTION_KINDS)
     duration_s: float = 30.0
     turns: float = 1.2
     start_turn: float = 0.0  # counted from where the last piece of the same kind ended
