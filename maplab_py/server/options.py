@@ -135,22 +135,22 @@ class EventLine:
 class ServerStatus(Report):
     """State of a map server and its map."""
 
-    is_running: bool
-    spool: Path
-    merged_map_folder: str
-    url: str
-    missions: int
-    vertices: int
-    landmarks: int
-    incoming: int  # not taken yet
-    preparing: int
-    waiting: int  # for a worker, or for the submap that they adjoin
-    merged: int
-    rejected: int
-    since_joint_optimization: int  # submaps
-    published_s_ago: float | None
-    robots: tuple[RobotLine, ...]
-    last_events: tuple[EventLine, ...]
+    is_running: bool = False
+    spool: Path = Path()
+    merged_map_folder: str = ""
+    url: str = ""
+    missions: int = 0
+    vertices: int = 0
+    landmarks: int = 0
+    incoming: int = 0  # not taken yet
+    preparing: int = 0
+    waiting: int = 0  # for a worker, or for the submap that they adjoin
+    merged: int = 0
+    rejected: int = 0
+    since_joint_optimization: int = 0  # submaps
+    published_s_ago: float | None = None
+    robots: tuple[RobotLine, ...] = ()
+    last_events: tuple[EventLine, ...] = ()
     problem: str = ""
 
 

@@ -144,15 +144,21 @@ class MapServer:
         incoming = len(self.spool.arrivals())
         preparing = sum(item.is_preparing for item in list(self._intake.items.values()))
         entries = {entry.number: entry.robot for entry in self.spool.entries()}
-        published = tuple(m for m in self.journal.merged if m.number not in entries)
+        merged = tuple(m for m in self.journal.merged if m.number not in entries)
+        published_s = self.publisher.published_s
         return status_of(
-            self,
-            dataclasses.replace(self.journal, merged=published),
+            self.spool,
+            dataclasses.replace(self.journal, merged=merged),
+            self.published,
+            list(entries.values()),
+            list(self.events.last),
+            is_running=True,
+            merged_map_folder=str(self.publisher.folder),
+            url=self._url,
             incoming=incoming,
             preparing=preparing,
-            pending=list(entries.values()),
+            published_s_ago=None if published_s is None else time.monotonic() - published_s,
             problem=self._problem,
-            url=self._url,
         )
 
     def delete_missions(self, ids: set[str]) -> server_options.DeletedMissions:

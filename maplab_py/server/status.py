@@ -1,21 +1,17 @@
 """The state of a server as a report, and its log."""
 
-from __future__ import annotations
-
 import contextlib
 import time
 from collections import Counter, deque
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 from maplab_py.progress import Progress
 from maplab_py.server.journal import Journal, read_journal
 from maplab_py.server.options import EventLine, RobotLine, ServerStatus
 from maplab_py.server.spool import Spool
 from maplab_py.vimap import VIMap, to_hex_list
-
-if TYPE_CHECKING:
-    from maplab_py.server.server import MapServer
 
 _LAST_EVENTS = 8
 
@@ -40,43 +36,6 @@ class Events:
             log.write(line + "\n")
 
 
-def status_of(
-    server: MapServer,
-    journal: Journal,
-    *,
-    incoming: int,
-    preparing: int,
-    pending: list[str],
-    problem: str,
-    url: str,
-) -> ServerStatus:
-    """Return the state of a server that runs.
-
-    Args:
-        journal: What is published.
-        incoming: Submaps that are not taken yet.
-        preparing: Submaps in workers.
-        pending: Robots of all submaps that are not published.
-        problem: What keeps it from publishing.
-        url: Where it answers.
-    """
-    published_s = server.publisher.published_s
-    return _status(
-        server.spool,
-        journal,
-        server.published,
-        is_running=True,
-        merged_map_folder=str(server.publisher.folder),
-        url=url,
-        incoming=incoming,
-        preparing=preparing,
-        pending=pending,
-        published_s_ago=None if published_s is None else time.monotonic() - published_s,
-        lines=list(server.events.last),
-        problem=problem,
-    )
-
-
 def status_without_server(spool: Spool) -> ServerStatus:
     """Return the state of a spool on which no server works.
 
@@ -87,66 +46,50 @@ def status_without_server(spool: Spool) -> ServerStatus:
         lines = spool.log.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
         lines = []
-    return _status(
-        spool,
-        read_journal(spool.journal),
-        None,
-        is_running=False,
-        merged_map_folder="",
-        url="",
-        incoming=len(spool.arrivals()),
-        preparing=0,
-        pending=[entry.robot for entry in spool.entries()],
-        published_s_ago=None,
-        lines=lines[-_LAST_EVENTS:],
-        problem="",
-    )
+    pending = [entry.robot for entry in spool.entries()]
+    journal, incoming = read_journal(spool.journal), len(spool.arrivals())
+    return status_of(spool, journal, None, pending, lines[-_LAST_EVENTS:], incoming=incoming)
 
 
-def _status(
+def status_of(
     spool: Spool,
     journal: Journal,
     vi_map: VIMap | None,
-    *,
-    is_running: bool,
-    merged_map_folder: str,
-    url: str,
-    incoming: int,
-    preparing: int,
     pending: list[str],
-    published_s_ago: float | None,
-    lines: list[str],
-    problem: str,
+    lines: Iterable[str],
+    **others: Any,
 ) -> ServerStatus:
+    """Return the state of a server and its spool.
+
+    Args:
+        journal: What is published.
+        vi_map: The map that is; None = it is not known.
+        pending: Robots of all submaps that are not published.
+        lines: The last lines of the log.
+        others: Fields of the status that do not follow from these.
+    """
     shown = vi_map or VIMap()
     known = shown.baseframes.is_known[shown.missions.baseframe]
     ids = to_hex_list(shown.missions.id)
     anchored = {mission for mission, is_known in zip(ids, known.tolist(), strict=True) if is_known}
-    merged = Counter(submap.robot for submap in journal.merged)
-    waiting = Counter(pending)
+    merged, waiting = Counter(submap.robot for submap in journal.merged), Counter(pending)
     robots = []
     for robot in sorted({*merged, *waiting}):
         missions = {m for m, name in journal.robots.items() if name == robot} - {*journal.deleted}
         of_robot = len(missions), len(missions & anchored)
         robots.append(RobotLine(robot, *of_robot, merged[robot], waiting[robot]))
     return ServerStatus(
-        is_running=is_running,
         spool=spool.root,
-        merged_map_folder=merged_map_folder,
-        url=url,
         missions=len(shown.missions),
         vertices=len(shown.vertices),
         landmarks=len(shown.landmarks),
-        incoming=incoming,
-        preparing=preparing,
-        waiting=max(len(pending) - preparing, 0),
+        waiting=max(len(pending) - others.get("preparing", 0), 0),
         merged=len(journal.merged),
         rejected=len(list(spool.rejected.glob("[0-9]*"))),
         since_joint_optimization=journal.since_joint,
-        published_s_ago=published_s_ago,
         robots=tuple(robots),
         last_events=tuple(_event(line) for line in lines),
-        problem=problem,
+        **others,
     )
 
 
