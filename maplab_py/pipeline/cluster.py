@@ -11,6 +11,7 @@ from typing import Any, Self
 from maplab_py.cancellation import check_cancelled
 from maplab_py.errors import MaplabError, UserError
 from maplab_py.memory import available_bytes
+from maplab_py.pipeline.engines import Engine
 from maplab_py.pipeline.execution import execute
 from maplab_py.pipeline.messages import Ending, Order, Outcome
 from maplab_py.pipeline.options import PipelineOptions
@@ -22,7 +23,7 @@ _SHARE = 0.9
 """Fraction of the memory that all local workers share."""
 
 
-class Cluster:
+class Cluster(Engine):
     """A client of a Dask scheduler; `local:N` also starts the scheduler and its workers.
 
     Dask runs the tasks of a lost worker again on another one. Only orders travel: folder names,
@@ -45,7 +46,6 @@ class Cluster:
                 f"--scheduler={options.scheduler} needs Dask: install the extra "
                 "(pip install 'maplab-py[cluster]')"
             ) from None
-        self.address = ""
         self._dask: Any = distributed
         self._options = options
         self._workers = options.local_workers()

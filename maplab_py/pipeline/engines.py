@@ -1,61 +1,31 @@
 """Execution of orders: in this process one after another, or on the workers of Dask."""
 
 from collections import deque
-from typing import Protocol, Self
+from typing import Self
 
 from maplab_py.pipeline import execution, messages
 from maplab_py.pipeline.options import PipelineOptions
 
 
-class Engine(Protocol):
-    """Runs orders and returns outcomes in the order in which they end."""
-
-    address: str  # of a page that shows what runs; empty where there is none
-
-    def slots(self) -> int:
-        """Return how many orders run at the same time."""
-
-    def slots_per_host(self) -> int:
-        """Return the largest number of orders that run on a machine at the same time."""
-
-    def share_gb(self) -> float:
-        """Return the memory of a task when all slots are taken [GB]; 0 = no limit."""
-
-    def submit(self, order: messages.Order) -> None:
-        """Take an order."""
-
-    def next_outcome(self) -> messages.Outcome:
-        """Wait until an order ends.
-
-        Raises:
-            MaplabError: The scheduler is lost.
-        """
-
-    def __enter__(self) -> Self:
-        """Start."""
-
-    def __exit__(self, *_: object) -> None:
-        """Stop all orders and everything that was started."""
-
-
-class SequentialEngine:
-    """Runs orders in turn, without Dask."""
+class Engine:
+    """Runs orders in turn, and returns outcomes in the order in which they end."""
 
     address = ""
+    """Page that shows what runs; empty where there is none."""
 
     def __init__(self) -> None:
         self._orders: deque[messages.Order] = deque()
 
     def slots(self) -> int:
-        """Return 1."""
+        """Return how many orders run at the same time."""
         return 1
 
     def slots_per_host(self) -> int:
-        """Return 1."""
+        """Return the largest number of orders that run on a machine at the same time."""
         return 1
 
     def share_gb(self) -> float:
-        """Return 0: the task has the machine."""
+        """Return the memory of a task when all slots are taken [GB]; 0 = no limit."""
         return 0.0
 
     def submit(self, order: messages.Order) -> None:
@@ -63,14 +33,19 @@ class SequentialEngine:
         self._orders.append(order)
 
     def next_outcome(self) -> messages.Outcome:
-        """Run the next order."""
+        """Wait until an order ends.
+
+        Raises:
+            MaplabError: The scheduler is lost.
+        """
         return execution.execute(self._orders.popleft())
 
     def __enter__(self) -> Self:
+        """Start."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._orders.clear()
+        """Stop all orders and everything that was started."""
 
 
 def engine_of(options: PipelineOptions) -> Engine:
@@ -80,7 +55,7 @@ def engine_of(options: PipelineOptions) -> Engine:
         UserError: Dask is not installed.
     """
     if options.scheduler == "none":
-        return SequentialEngine()
+        return Engine()
     from maplab_py.pipeline.cluster import Cluster
 
     return Cluster(options)
