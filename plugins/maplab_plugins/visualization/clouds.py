@@ -93,7 +93,7 @@ def _show(
     playback: PlaybackOptions | None = None,
 ) -> ViewReport:
     """Load the clouds of a resource type and show them with the map."""
-    from maplab_py.viewer import building, resource_clouds
+    from maplab_py.viewer import resource_clouds
 
     folder = context.map_folder or Path()
     loaded = resource_clouds.load_clouds(
@@ -101,8 +101,8 @@ def _show(
     )
     if clouds.export_accumulated_pc_to_ply_path:
         _write(loaded, Path(clouds.export_accumulated_pc_to_ply_path))
-    subject = building.Subject(context.vi_map, context.map_key, options, clouds=loaded)
-    return show(context, subject, display, playback=playback, plays=playback is not None)
+    plays = playback is not None
+    return show(context, display, options, playback=playback, plays=plays, clouds=loaded)
 
 
 def _write(clouds: tuple[Cloud, ...], path: Path) -> None:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from maplab_py.cancellation import check_cancelled, lasting_effect
 from maplab_py.options import Options, option
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from maplab_py.viewer.display.viewer import Viewer
     from maplab_py.viewer.drawing import ImageOf
     from maplab_py.viewer.history import State
-    from maplab_py.viewer.options import PlaybackOptions
+    from maplab_py.viewer.options import PlaybackOptions, VisualizationOptions
     from maplab_py.vimap import VIMap
 
 NAME = "viewer"
@@ -219,33 +219,48 @@ def ensure_viewer(context: CommandContext, options: ViewerOptions) -> Viewer:
 
 def show(
     context: CommandContext,
-    subject: Subject,
-    viewer_options: ViewerOptions,
+    display: ViewerOptions,
+    options: VisualizationOptions | None = None,
     *,
+    vi_map: VIMap | None = None,
+    title: str = "",
     playback: PlaybackOptions | None = None,
     image_of: ImageOf | None = None,
     plays: bool = False,
+    **drawn: Any,
 ) -> ViewReport:
-    """Show a subject in the session's viewer and say what is to be seen.
+    """Show a map in the session's viewer and say what is to be seen.
 
     Args:
         context: Of the command.
-        subject: What to show.
-        viewer_options: Where.
+        display: Where.
+        options: Layers and their style; None = the defaults.
+        vi_map: The map; None = the selected one.
+        title: Its name; empty = the key of the selected map.
         playback: How the time slider plays it.
         image_of: Images of vertices; those that the map has as resources when not given.
         plays: Start to play at once.
+        drawn: What else is drawn, see `Subject`.
     """
+    from maplab_py.viewer import building
+    from maplab_py.viewer.options import VisualizationOptions
+
+    subject = building.Subject(
+        vi_map or context.vi_map,
+        title or context.map_key,
+        options or VisualizationOptions(),
+        **drawn,
+    )
     began = time.perf_counter()
     images = image_of or images_of(subject.vi_map, context.map_folder)
-    if viewer_options.program == "rerun":
-        return _show_in_rerun(subject, viewer_options, images)
-    if viewer_options.file is not None:
+    if display.program == "rerun":
+        return _show_in_rerun(subject, display, images)
+    if display.file is not None:
         raise UserError(
             "--viewer_file is for --viewer=rerun; export_view writes the page to a file"
         )
     context.progress.step(0, 2, "start the viewer")
-    viewer = ensure_viewer(context, viewer_options)
+    viewer = ensure_viewer(context, display)
     check_cancelled()
     context.progress.step(1, 2, "draw the map")
     subject = _with_history(context, in_colours(subject.replace(images=images)))

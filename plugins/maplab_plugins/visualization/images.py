@@ -47,9 +47,8 @@ visualize_optimized_depth_maps = _player(
 def _show(
     context: CommandContext, name: str, playback: PlaybackOptions, display: ViewerOptions
 ) -> ViewReport:
-    from maplab_py.viewer import building, resource_clouds
+    from maplab_py.viewer import resource_clouds
 
     resource_clouds.resource_rows(context.vi_map, name)
     images = resource_clouds.VertexImages(context.vi_map, context.map_folder or Path(), name)
-    subject = building.Subject(context.vi_map, context.map_key)
-    return show(context, subject, display, playback=playback, image_of=images, plays=True)
+    return show(context, display, playback=playback, image_of=images, plays=True)

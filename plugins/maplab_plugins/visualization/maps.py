@@ -54,18 +54,16 @@ def visualize(
         informative_segments: CSV with the columns mission, start_ns, end_ns, information: pieces of
             missions to colour by their information.
     """
-    from maplab_py.viewer.building import Subject
-
-    subject = Subject(context.vi_map, context.map_key, options)
+    truth = segments = None
     if ground_truth is not None:
         from maplab_py.interop.trajectories import read_trajectory
 
-        subject = subject.replace(truth=read_trajectory(ground_truth, needs_orientation=False))
+        truth = read_trajectory(ground_truth, needs_orientation=False)
     if informative_segments is not None:
         from maplab_py.viewer.layers.references import read_segments
 
-        subject = subject.replace(segments=read_segments(informative_segments, context.vi_map))
-    return show(context, subject, display)
+        segments = read_segments(informative_segments, context.vi_map)
+    return show(context, display, options, truth=truth, segments=segments)
 
 
 @command("visualize_sequentially", "vs", see_also=("visualize",), guards_effects=True)
@@ -78,11 +76,8 @@ def visualize_sequentially(
     display: ViewerOptions = ViewerOptions(),
 ) -> ViewReport:
     """Play the missions in the browser: the map grows as it was recorded."""
-    from maplab_py.viewer.building import Subject
-
-    missions = chosen.rows(context.vi_map)
-    subject = Subject(_only(context.vi_map, missions), context.map_key, options)
-    return show(context, subject, display, playback=playback, plays=True)
+    vi_map = _only(context.vi_map, chosen.rows(context.vi_map))
+    return show(context, display, options, vi_map=vi_map, playback=playback, plays=True)
 
 
 @command("visualize_landmark_observers", guards_effects=True)
@@ -93,10 +88,7 @@ def visualize_landmark_observers(
     display: ViewerOptions = ViewerOptions(),
 ) -> ViewReport:
     """Show the rays from every observing camera to the good landmarks."""
-    from maplab_py.viewer.building import Subject
-
-    subject = Subject(context.vi_map, context.map_key, options, shows_observers=True)
-    return show(context, subject, display)
+    return show(context, display, options, shows_observers=True)
 
 
 @command("visualize_sensor_extrinsics", guards_effects=True)
@@ -104,10 +96,7 @@ def visualize_sensor_extrinsics(
     context: CommandContext, *, display: ViewerOptions = ViewerOptions()
 ) -> ViewReport:
     """Show how the sensors are mounted: each as axes on its base sensor."""
-    from maplab_py.viewer.building import Subject
-
-    title = f"{context.map_key}: sensors"
-    return show(context, Subject(context.vi_map, title, shows_sensors=True), display)
+    return show(context, display, title=f"{context.map_key}: sensors", shows_sensors=True)
 
 
 @command("visualize_loop_closures", guards_effects=True)
@@ -122,7 +111,6 @@ def visualize_loop_closures(
     A click on a closure shows the line of lc_report: query, target, inliers, correction, verdict.
     """
     from maplab_py.algorithms.loop_closure.closure_record import read_record
-    from maplab_py.viewer.building import Subject
     from maplab_py.viewer.layers.closures import ACCEPTED
     from maplab_py.viewer.layers.covariances import LOOP_CLOSURES
 
@@ -132,11 +120,8 @@ def visualize_loop_closures(
             f"map '{context.map_key}' has no loop closures: loopclosure_all_missions finds them",
             remedy="loopclosure_all_missions",
         )
-    subject = Subject(
-        vi_map, context.map_key, options,
-        only_layers=("trajectories", "vertices", "loop_closures", LOOP_CLOSURES, ACCEPTED),
-    )  # fmt: skip
-    return show(context, subject, display)
+    layers = "trajectories", "vertices", "loop_closures", LOOP_CLOSURES, ACCEPTED
+    return show(context, display, options, only_layers=layers)
 
 
 @command(
@@ -167,7 +152,6 @@ def visualize_difference(
         side_by_side: Draw the other state or map beside the map instead of over it.
         swipe: Draw it left of a line that the page moves over both.
     """
-    from maplab_py.viewer.building import Subject
     from maplab_py.viewer.layers.references import displacements
 
     if side_by_side and swipe:
@@ -180,10 +164,7 @@ def visualize_difference(
             "--side_by_side and --swipe show both all the same"
         )
     arrangement: Arrangement = "beside" if side_by_side else "swipe" if swipe else "over"
-    subject = Subject(
-        context.vi_map, context.map_key, options, other, name, arrangement=arrangement
-    )
-    view = show(context, subject, display)
+    view = show(context, display, options, other=other, other_name=name, arrangement=arrangement)
     missing = len(context.vi_map.vertices) + len(other.vertices) - 2 * len(here)
     mean_m, largest_m = (distance.mean(), distance.max()) if len(here) else (np.nan, np.nan)
     return DifferenceReport(name, len(here), missing, float(mean_m), float(largest_m), view)
@@ -210,7 +191,6 @@ def visualize_changes(
         session: Key of a map in memory, or folder of a map, of a later session.
     """
     from maplab_py.algorithms.map_update.update import changes_since
-    from maplab_py.viewer.building import Subject
     from maplab_py.viewer.layers.changes import ChangeImages, mesh_clouds
 
     other = map_of_key_or_folder(context, session)
@@ -224,11 +204,10 @@ def visualize_changes(
     count = counted(len(report.changes), "change")
     dates = (date.replace("T", " ")[:-3] for date in (report.earlier, report.later))
     note = f"{count} from {' to '.join(dates)}; {report.note}".rstrip("; ")
-    subject = Subject(
-        context.vi_map, context.map_key, options, changes=report.changes, note=note,
-        clouds=mesh_clouds(changed_meshes(context, whole, other, session)),
-    )  # fmt: skip
-    return show(context, subject, display, image_of=images)
+    clouds = mesh_clouds(changed_meshes(context, whole, other, session))
+    return show(
+        context, display, options, image_of=images, changes=report.changes, note=note, clouds=clouds
+    )
 
 
 def _other_state(context: CommandContext, map_key: str, snapshot: str) -> tuple[VIMap, str]:

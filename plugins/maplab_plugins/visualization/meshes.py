@@ -36,7 +36,6 @@ def visualize_mesh(
         dense_tsdf_mesh_min_weight: Weight from which voxels count as observed, in measurements at 2 m.
         dense_result_mesh_colours: Colour the mesh of the grids by the images of the map, as colour does.
     """
-    from maplab_py.viewer.building import Subject
     from maplab_py.viewer.mesh_sources import coloured_mesh, grid_mesh, read_mesh
 
     reference = None
@@ -53,8 +52,7 @@ def visualize_mesh(
             progress=context.progress,
         )  # fmt: skip
     mesh = coloured_mesh(mesh, mesh_colouring, reference)
-    subject = Subject(context.vi_map, context.map_key, options, clouds=(mesh,))
-    return show(context, subject, display)
+    return show(context, display, options, clouds=(mesh,))
 
 
 @command(
@@ -76,10 +74,9 @@ def visualize_esdf(
         dense_esdf_slice_height_m: Height of the slice in the global frame; empty = the median height of
             the vertices.
     """
-    from maplab_py.viewer import building, mesh_sources
+    from maplab_py.viewer import mesh_sources
 
     rows = missions.rows(context.vi_map)
     folder = context.map_folder or Path()
     cloud = mesh_sources.field_slice(context.vi_map, folder, rows, dense_esdf_slice_height_m)
-    subject = building.Subject(context.vi_map, context.map_key, options, clouds=(cloud,))
-    return show(context, subject, display)
+    return show(context, display, options, clouds=(cloud,))
