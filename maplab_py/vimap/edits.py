@@ -9,7 +9,7 @@ from maplab_py.array_types import F64, I64, Mask
 from maplab_py.geometry import se3, so3
 from maplab_py.vimap.ids import IdArray, is_valid, random_ids
 from maplab_py.vimap.selection import as_mask, as_rows, keep_rows
-from maplab_py.vimap.table import object_column
+from maplab_py.vimap.table import connected_groups, object_column
 from maplab_py.vimap.tables import NO_ROW, LandmarkQuality, Landmarks, ResourceOwner
 from maplab_py.vimap.vertex_removal import move_landmarks, remove_vertices, stores_for
 from maplab_py.vimap.vi_map import VIMap
@@ -136,16 +136,12 @@ def merge_landmarks(vi_map: VIMap, from_rows: ArrayLike, into_rows: ArrayLike) -
 
 def survivors(source: I64, target: I64, count: int) -> I64:
     """Return the row (count,) that each landmark ends up in when `merge_landmarks` merges pairs (N,)."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    links = coo_array((np.ones(len(source), dtype=np.int8), (source, target)), shape=(count, count))
-    groups, label = connected_components(links, directed=False)
+    label = connected_groups(source, target, count)
     is_source = np.zeros(count, dtype=np.bool_)
     is_source[source[source != target]] = True
     # the first of each group when sorted by (is a source, row)
     order = np.lexsort((np.arange(count), is_source, label))
-    first = np.zeros(groups, dtype=np.int64)
+    first = np.zeros(count, dtype=np.int64)
     first[label[order[::-1]]] = order[::-1]
     return np.asarray(first[label])
 

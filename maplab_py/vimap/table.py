@@ -148,6 +148,15 @@ def ragged_rows(start: NDArray[np.int64], rows: NDArray[Any]) -> NDArray[np.int6
     return np.asarray(np.arange(total, dtype=np.int64) + shift)
 
 
+def connected_groups(first: NDArray[Any], second: NDArray[Any], count: int) -> I64:
+    """Return the group (count,), numbered from 0, of rows that pairs of rows (N,) connect."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    links = coo_array((np.ones(len(first), dtype=np.int8), (first, second)), shape=(count, count))
+    return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
+
+
 def starts_of_counts(counts: NDArray[Any]) -> NDArray[np.int64]:
     """Turn counts (N,) into CSR offsets (N + 1,)."""
     start = np.zeros(len(counts) + 1, dtype=np.int64)

@@ -13,7 +13,7 @@ from maplab_py.distinct import distinct
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import VIMap, mission_mask, tables, type_name
+from maplab_py.vimap import VIMap, mission_mask, table, tables, type_name
 from maplab_py.vision import descriptors, epipolar_matching, track_union
 
 
@@ -147,9 +147,6 @@ def _rays(
 
 def _tracks(vi_map: VIMap, links: _Links) -> tuple[I64, Mask]:
     """Return the track (K,) of every keypoint that gets one, else -1, and which links were used."""
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import connected_components
-
     track = np.full(len(vi_map.keypoints), -1, dtype=np.int64)
     if not len(links.first):
         return track, np.zeros(0, dtype=np.bool_)
@@ -164,9 +161,7 @@ def _tracks(vi_map: VIMap, links: _Links) -> tuple[I64, Mask]:
         vi_map.keypoint_frame[rows].astype(np.int64),
         len(vi_map.frames),
     )
-    ones = np.ones(int(accepted.sum()), dtype=np.int8)
-    graph = csr_array((ones, (a[accepted], b[accepted])), shape=(len(rows), len(rows)))
-    _, part = connected_components(graph, directed=False)
+    part = table.connected_groups(a[accepted], b[accepted], len(rows))
     size = np.bincount(part, minlength=1)
     linked = size[part] >= 2
     track[rows[linked]] = _numbers(vi_map, rows[linked], part[linked])

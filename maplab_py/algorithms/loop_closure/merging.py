@@ -13,10 +13,11 @@ from maplab_py.algorithms.loop_closure.features import points_in_mission
 from maplab_py.algorithms.loop_closure.guided_matching import LandmarkMatches, guided_matches
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.reports import GAP, UNKNOWN_BASE_FRAME
-from maplab_py.array_types import F64, I64, Mask, NDArray
+from maplab_py.array_types import F64, I64, Mask, NDArray, Rows
 from maplab_py.distinct import distinct
 from maplab_py.geometry import se3, so3
 from maplab_py.vimap import VIMap, edits, observer_counts, ragged_rows, starts_of_counts
+from maplab_py.vimap.table import connected_groups
 from maplab_py.vision.point_covariance import ClosurePoses, LandmarkPairs, squared_sigmas
 from maplab_py.vision.track_union import unite_tracks
 
@@ -26,14 +27,12 @@ UNLIKELY = "farther apart than their rays allow"
 SAME_IMAGE = "both seen in one image"
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class MergeResult:
-    """Result of merging, with the closures that support each merge."""
+class MergeResult(Rows):
+    """Result of merging: rows of pairs of landmarks (rows before) and closures that support their merge."""
 
     landmarks_merged: int
     observations_moved: int
     refused: dict[str, int]  # landmark pairs by reason
-    # one row per pair of landmarks (rows before merging) and closure that supports their merge
     first: I64  # (P,)
     second: I64  # (P,)
     closure: I64  # (P,) row of the closure
@@ -62,14 +61,11 @@ def merge_verified_landmarks(
     guided = guided_matches(merged, closures, usable, options)
     remerged, more = _merge(merged, closures, guided, options)
     row_before = vi_map.landmark_index.rows(merged.landmarks.id)
-    return remerged, MergeResult(
+    more = dataclasses.replace(more, first=row_before[more.first], second=row_before[more.second])
+    return remerged, dataclasses.replace(
+        MergeResult.concatenate([result, more]),
         landmarks_merged=result.landmarks_merged + more.landmarks_merged,
         observations_moved=result.observations_moved + more.observations_moved,
-        refused=result.refused,
-        first=np.concatenate([result.first, row_before[more.first]]),
-        second=np.concatenate([result.second, row_before[more.second]]),
-        closure=np.concatenate([result.closure, more.closure]),
-        wanted=np.concatenate([result.wanted, more.wanted]),
     )
 
 
@@ -81,20 +77,16 @@ def _merge(
     closure = matches.closure
     source = vi_map.keypoints.landmark[matches.keypoint].astype(np.int64)
     target = matches.landmark
-    open_ = (source >= 0) & (source != target)
 
-    def refuse(reason: str, mask: NDArray[np.bool_]) -> None:
-        if mask.any():
-            pairs = np.stack([source[mask], target[mask]], axis=1)
+    def without(reason: str, rows: I64, refusing: Mask) -> I64:
+        if refusing.any():
+            pairs = np.stack([source[rows[refusing]], target[rows[refusing]]], axis=1)
             refused[reason] = len(np.unique(pairs, axis=0))
+        return rows[~refusing]
 
-    unknown = open_ & ~_mergeable(vi_map, closures)[closure]
-    refuse(UNKNOWN_BASE_FRAME, unknown)
-    open_ &= ~unknown
-    gap = open_ & (closures.correction_m[closure] > options.max_merge_gap_m)
-    refuse(GAP, gap)
-    open_ &= ~gap
-    rows = np.flatnonzero(open_)
+    rows = np.flatnonzero((source >= 0) & (source != target))
+    rows = without(UNKNOWN_BASE_FRAME, rows, ~_mergeable(vi_map, closures)[closure[rows]])
+    rows = without(GAP, rows, closures.correction_m[closure[rows]] > options.max_merge_gap_m)
     distance = compare_landmarks(
         vi_map, closures, closure[rows], source[rows], target[rows], options.ransac_pixel_sigma
     )
@@ -102,10 +94,8 @@ def _merge(
         options.max_merge_distance_m, options.max_merge_distance_ratio * distance.depth_m
     )
     likely = distance.squared_sigmas <= options.max_merge_sigma**2
-    for reason, which in ((TOO_FAR, ~near), (UNLIKELY, near & ~likely)):
-        mask = np.zeros(len(source), dtype=np.bool_)
-        mask[rows[which]] = True
-        refuse(reason, mask)
+    without(TOO_FAR, rows, ~near)
+    without(UNLIKELY, rows, near & ~likely)
     rows = rows[near & likely]
     query = closures.query_vertex[closure[rows]]
     is_doubtful = distance.is_doubtful(options.max_merge_distance_m)[near & likely]
@@ -140,16 +130,11 @@ def _triangulate(vi_map: VIMap, landmarks: I64) -> VIMap:
 
 def _into_best(vi_map: VIMap, first: I64, second: I64) -> tuple[I64, I64]:
     """Return the landmarks (N,) that are absorbed and the best member (N,) of each one's component."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     members, row = np.unique(np.concatenate([first, second]), return_inverse=True)
-    a, b = row[: len(first)], row[len(first) :]
-    links = coo_array((np.ones(len(a), dtype=np.int8), (a, b)), shape=(len(members),) * 2)
-    groups, group = connected_components(links, directed=False)
+    group = connected_groups(row[: len(first)], row[len(first) :], len(members))
     sigma_m = predicted_sigma(vi_map, members)
     order = np.lexsort((members, sigma_m, -vi_map.landmarks.quality[members], group))
-    begins = np.searchsorted(group[order], np.arange(groups))
+    begins = np.searchsorted(group[order], np.arange(int(group.max(initial=-1)) + 1))
     survivor = members[order[begins]][group]
     absorbed = survivor != members
     return members[absorbed], survivor[absorbed]
@@ -237,8 +222,7 @@ class Votes:
     is_doubtful: Mask  # (N,) the positions say little for one point; see `Agreement.is_doubtful`
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class United:
+class United(Rows):
     """Pairs of landmarks to merge, one row per vote for them."""
 
     first: I64  # (P,)
@@ -279,7 +263,7 @@ def unite(vi_map: VIMap, votes: Votes, min_votes: int) -> United:
     label = np.arange(count)
     links = np.zeros((2, 0), dtype=np.int64)
     none = np.zeros(0, dtype=np.int64)
-    parts = [(none, none, none, none)]
+    parts = [United(none, none, none, none, 0, 0)]
     for _ in range(_ROUNDS):
         pairs = count_pairs(votes, label)
         wanted = np.minimum(observers[pairs.first], observers[pairs.second])
@@ -298,16 +282,14 @@ def unite(vi_map: VIMap, votes: Votes, min_votes: int) -> United:
         is_united[order[fits]] = True
         vote = np.flatnonzero(is_united[pairs.of_vote])
         of_vote = pairs.of_vote[vote]
-        parts.append((pairs.first[of_vote], pairs.second[of_vote], vote, wanted[of_vote]))
+        parts.append(
+            United(pairs.first[of_vote], pairs.second[of_vote], vote, wanted[of_vote], 0, 0)
+        )
         links = np.concatenate([links, both[:, fits]], axis=1)
         label = _components(links, count)
         np.maximum.at(observers, label, observers)
-    merged = [np.concatenate(column) for column in zip(*parts, strict=True)]
-    return United(
-        first=merged[0],
-        second=merged[1],
-        vote=merged[2],
-        wanted=merged[3],
+    return dataclasses.replace(
+        United.concatenate(parts),
         too_few=int(np.count_nonzero(~enough)),
         seen_together=int(np.count_nonzero(~fits)),
     )
@@ -342,11 +324,7 @@ def count_pairs(votes: Votes, label: I64) -> Pairs:
 
 def _components(links: I64, count: int) -> I64:
     """Return the smallest row (count,) that each landmark is connected with by links (2, N)."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    graph = coo_array((np.ones(links.shape[1], dtype=np.int8), tuple(links)), shape=(count, count))
-    groups, label = connected_components(graph, directed=False)
-    smallest = np.full(groups, count, dtype=np.int64)
+    label = connected_groups(links[0], links[1], count)
+    smallest = np.full(count, count, dtype=np.int64)
     np.minimum.at(smallest, label, np.arange(count))
     return np.asarray(smallest[label])

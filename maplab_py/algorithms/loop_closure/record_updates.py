@@ -22,6 +22,7 @@ from maplab_py.distinct import distinct
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3
 from maplab_py.vimap import IdArray, IdIndex, LoopClosureEdges, VIMap, edits, to_hex_list
+from maplab_py.vimap.table import connected_groups
 
 REMOVED = closure_table.VERDICTS.index(Verdict.REMOVED)
 _BAN_REACH_M = 2.0
@@ -230,12 +231,7 @@ def _still_wanted(pairs: MergePairs, closures: ClosureRecord) -> MergePairs:
 
 def _groups(landmarks: IdIndex, count: int, pairs: MergePairs) -> I64:
     """Label recorded landmarks (count,) by connected component of the pairs."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    a, b = landmarks.rows(pairs.first), landmarks.rows(pairs.second)
-    graph = coo_array((np.ones(len(a), dtype=np.int8), (a, b)), shape=(count, count))
-    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
+    return connected_groups(landmarks.rows(pairs.first), landmarks.rows(pairs.second), count)
 
 
 def _restore(
