@@ -29,7 +29,6 @@ class Entity(Enum):
     CLOSURE = "closure"  # one that the map remembers
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class Points(Rows):
     """A cloud."""
 
@@ -40,7 +39,6 @@ class Points(Rows):
     labels: tuple[str, ...] = ()  # one for each of the first points; empty = no label
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class Segments(Rows):
     """Straight lines."""
 
@@ -50,7 +48,6 @@ class Segments(Rows):
     width_px: float = 1.5
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class Axes(Rows):
     """Coordinate frames with a name each."""
 

@@ -367,7 +367,6 @@ _COLOUR = (255, 153, 0)
 _GAP_PX = 6
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
 class Matches(Rows):
     """Keypoints of two images that show the same point."""
 
