@@ -16,19 +16,13 @@ from maplab_py.errors import Cancelled
 
 
 class CancelToken:
-    """Cancellation state of one command, and whether it has had lasting effects.
-
-    Attributes:
-        cancelled: The command is to raise Cancelled at its next check.
-        has_effects: The command has had a lasting effect, such as a written file.
-        is_ending: The command was asked to end early with what it has.
-    """
+    """Cancellation state of one command, and whether it has had lasting effects."""
 
     def __init__(self) -> None:
         """Create a token that is not cancelled."""
-        self.cancelled = False
-        self.has_effects = False
-        self.is_ending = False
+        self.cancelled = False  # the command is to raise Cancelled at its next check
+        self.has_effects = False  # the command has had a lasting effect, such as a written file
+        self.is_ending = False  # the command was asked to end early with what it has
         self._can_end_early = 0  # nested blocks that can
         self._abandoned = False
         self._depth = 0  # of nested effects

@@ -5,14 +5,11 @@ from contextlib import contextmanager
 
 
 class MaplabError(Exception):
-    """Base class of all errors that maplab-py raises deliberately.
-
-    Attributes:
-        remedy: Command line after which the refused command can be run again; empty if none is known.
-    """
+    """Base class of all errors that maplab-py raises deliberately."""
 
     def __init__(self, *message: object, remedy: str = "") -> None:
         super().__init__(*message)
+        # command line after which the refused command can be run again; empty if none is known
         self.remedy = remedy
 
 

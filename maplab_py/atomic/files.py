@@ -23,10 +23,6 @@ class PendingFile:
     """New content of a file under a hidden name beside it, locked until published or discarded.
 
     The hidden name is given up once, by one thread: after that another writer may be using it.
-
-    Attributes:
-        target: The file, with symbolic links followed.
-        stream: Stream for the content.
     """
 
     def __init__(self, path: Path, *, durable: bool = True) -> None:
@@ -42,7 +38,7 @@ class PendingFile:
             UserError: The path cannot be a file, or another program is writing it.
             Cancelled: The running command was cancelled while the other program was writing it.
         """
-        self.target = resolved(path)
+        self.target = resolved(path)  # the file, with symbolic links followed
         if self.target.is_dir():
             raise UserError(f"{path} is a folder: name a file")
         self._path, self._durable = path, durable
@@ -51,6 +47,7 @@ class PendingFile:
         self._has_name = True  # the hidden one
         self._made = make_folders(self.target.parent)
         try:
+            # stream for the content
             self.stream: BinaryIO = os.fdopen(_claimed(self._temporary, self.target, path), "wb")
         except BaseException:
             remove_folders(self._made)

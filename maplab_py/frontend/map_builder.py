@@ -24,11 +24,7 @@ _MIN_VERTICES = 2
 
 
 class MapBuilder:
-    """Collects vertices; `finish` makes the map. Each start of the odometry is a mission of the map.
-
-    Attributes:
-        missions: Records of all missions, those without vertices included; the last one grows.
-    """
+    """Collects vertices; `finish` makes the map. Each start of the odometry is a mission of the map."""
 
     def __init__(self, device: RecordedSensors, options: MapBuilderOptions | None = None) -> None:
         """Start without missions.
@@ -41,6 +37,7 @@ class MapBuilder:
         self._images = None
         if self._options.save_image_as_resources:
             self._images = NewResources(seed=seed)
+        # records of all missions, those without vertices included; the last one grows
         self.missions: list[RecordedMission] = []
         self._devices: list[RecordedSensors] = []  # of the missions
         self._waiting: dict[int, tuple[VertexFrames, list[int]]] = {}

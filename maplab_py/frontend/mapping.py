@@ -37,20 +37,7 @@ class Observer(Protocol):
 
 
 class Mapping:
-    """A run over a recording.
-
-    Attributes:
-        odometry: The estimator.
-        builder: The map so far; None without a map.
-        localization: Where the odometry is in a map; None without a map to localise in.
-        localized: What it has said of all frames.
-        localized_frame: What it has said of the newest frame; None before the first.
-        statistics: Counts and times.
-        problem: Why the run ended before the end of the recording; empty if it did not.
-        is_ended_early: The user has ended the run before the end of the recording.
-        doubts: What the map says against the calibration; None if nobody has looked.
-        is_mended: The recording is read with another calibration than its own.
-    """
+    """A run over a recording."""
 
     def __init__(
         self,
@@ -85,25 +72,30 @@ class Mapping:
         self._keypoints = vertex_keypoints.VertexKeypoints(
             features, self.options.builder.features_every
         )
+        # where the odometry is in a map; None without a map to localise in
         self.localization = online.opened_localization(localization, device, self.options.odometry)
-        self.localized = record.LocalizationRecord()
+        self.localized = record.LocalizationRecord()  # what it has said of all frames
+        # what it has said of the newest frame; None before the first
         self.localized_frame: online.LocalizedFrame | None = None
         is_tight = self.localization is not None and localization.mode == "vil"
+        # the recording is read with another calibration than its own
         self.is_mended = isinstance(recording, mending.MendedRecording)
         odometry = self.options.odometry
+        # the estimator
         self.odometry = Odometry(
             device,
             odometry.for_doubted() if self.is_mended else odometry,
             make_starter=make_starter,
             map_rule=localization.rule if is_tight else None,
         )
-        self.builder: map_builder.MapBuilder | None = None
+        self.builder: map_builder.MapBuilder | None = None  # the map so far; None without a map
         if self.options.output.run_map_builder:
             self.builder = map_builder.MapBuilder(recording.device, self.options.builder)
         self.stream = stream.EventStream(recording, self.options.stream)
-        self.statistics = run_statistics.RunStatistics()
-        self.problem = ""
-        self.is_ended_early = False
+        self.statistics = run_statistics.RunStatistics()  # counts and times
+        self.problem = ""  # why the run ended before the end of the recording; empty if it did not
+        self.is_ended_early = False  # the user has ended the run before the end of the recording
+        # what the map says against the calibration; None if nobody has looked
         self.doubts: tuple[findings.Finding, ...] | None = None
         self._keeps_states = keeps_states
         self._states = array("d")  # time apart, rows of 16 numbers

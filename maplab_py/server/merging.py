@@ -101,13 +101,7 @@ class _ClosedLoops:
 
 
 class Merger:
-    """Merges submaps into a map; see the module.
-
-    Attributes:
-        vi_map: The map; None before the first submap.
-        radius: Trust region of the last joint optimisation; 0 = the default.
-        note: What the last joint optimisation had to leave out.
-    """
+    """Merges submaps into a map; see the module."""
 
     def __init__(
         self,
@@ -127,7 +121,9 @@ class Merger:
             optimization: Of a part, and of all.
             map_folder: Where the map is published, for its clouds; None = clouds are not looked at.
         """
-        self.vi_map: VIMap | None = None
+        self.vi_map: VIMap | None = None  # the map; None before the first submap
+        # note: what the last joint optimisation had to leave out
+        # radius: trust region of the last joint optimisation; 0 = the default
         self.radius, self.note = 0.0, ""
         self._map_folder = map_folder
         self._merging, self._incremental = merging, incremental

@@ -178,15 +178,11 @@ class WorkerPool:
 
 
 class _Worker(Service):
-    """A worker process.
-
-    Attributes:
-        orders: How many it has been given.
-    """
+    """A worker process."""
 
     def __init__(self, threads: int, idle_s: float) -> None:
         super().__init__("maplab_py.server.worker", repr(idle_s), threads=threads)
-        self.orders = 0
+        self.orders = 0  # how many it has been given
 
     def run(self, order: SubmapOrder, is_cancelled: Callable[[], bool]) -> Outcome | None:
         """Run an order; None where the process had ended before it got the order."""
@@ -235,18 +231,14 @@ class Item:
 
 
 class Intake:
-    """Accepts submaps and has them prepared.
-
-    Attributes:
-        items: All submaps that are accepted and not published yet, by number.
-        rejected: How many were rejected.
-    """
+    """Accepts submaps and has them prepared."""
 
     def __init__(
         self, spool: Spool, preparation: Preparation, publisher: Publisher, events: Events
     ) -> None:
+        # all submaps that are accepted and not published yet, by number
         self.items: dict[int, Item] = {}
-        self.rejected = 0
+        self.rejected = 0  # how many were rejected
         self._spool, self._preparation = spool, preparation
         self._publisher, self._events = publisher, events
         self._next_number = 1

@@ -33,25 +33,19 @@ def pause_s(duration_s: float) -> float:
 
 
 class Publisher:
-    """Writes a map to its folder, and keeps copies.
-
-    Attributes:
-        folder: Folder of the map.
-        published_s: When the map was last published [s, monotonic]; None = not yet.
-        duration_s: How long that took.
-        files: Number of files of the map.
-        files_taken_over: How many of them were not written again.
-        is_compressed: All files that were written are compressed.
-    """
+    """Writes a map to its folder, and keeps copies."""
 
     def __init__(self, options: PublishingOptions) -> None:
         """Prepare; nothing is written yet."""
-        self.folder = Path(options.merged_map_folder).absolute()
+        self.folder = Path(options.merged_map_folder).absolute()  # folder of the map
         self.backups = self.folder.parent / f"{self.folder.name}_backups"
+        # when the map was last published [s, monotonic]; None = not yet
         self.published_s: float | None = None
-        self.duration_s = 0.0
+        self.duration_s = 0.0  # how long that took
+        # files_taken_over: how many of them were not written again
+        # files: number of files of the map
         self.files = self.files_taken_over = 0
-        self.is_compressed = True
+        self.is_compressed = True  # all files that were written are compressed
         self._options = options
         self._files: list[tuple[Path, Path]] = []
         self._written = WrittenFiles()

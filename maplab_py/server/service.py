@@ -37,12 +37,7 @@ Answer = Callable[[dict[str, str]], Any]
 
 
 class Service:
-    """Answers requests in threads of its own while the block lasts.
-
-    Attributes:
-        url: Where it listens.
-        token: What requests must carry; empty on loopback.
-    """
+    """Answers requests in threads of its own while the block lasts."""
 
     def __init__(
         self,
@@ -65,6 +60,7 @@ class Service:
         Raises:
             UserError: It cannot listen there.
         """
+        # what requests must carry; empty on loopback
         self.token = "" if address == LOOPBACK else secrets.token_urlsafe(24)
         handler = type(
             "_BoundHandler", (_Handler,), {"reads": reads, "writes": writes, "token": self.token}
@@ -76,7 +72,7 @@ class Service:
                 f"--serve_address={address} --serve_port={port}: cannot listen there ({error})"
             ) from error
         self._server.daemon_threads = True
-        self.url = f"http://{address}:{self._server.server_address[1]}"
+        self.url = f"http://{address}:{self._server.server_address[1]}"  # where it listens
         self._file = file
         self._thread = threading.Thread(
             target=self._server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True

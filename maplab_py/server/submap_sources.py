@@ -24,10 +24,6 @@ class SubmapWriter:
     The states of a part are those that the odometry has when it is pushed. The vertices of a mission that
     was given up after a failure of the odometry are not pushed any more. On runs of hours the map's memory is
     bounded: what was pushed is removed from it.
-
-    Attributes:
-        pushed: How many parts were pushed.
-        is_whole: No vertices were left out.
     """
 
     def __init__(self, output: SubmapOutput, *, forgets: bool = False) -> None:
@@ -38,6 +34,8 @@ class SubmapWriter:
             forgets: Remove the vertices of a part from the map of the run when it is pushed.
         """
         assert output.submap_spool is not None
+        # is_whole: no vertices were left out
+        # pushed: how many parts were pushed
         self.pushed, self.is_whole = 0, True
         self._spool, self._output, self._forgets = Spool(output.submap_spool), output, forgets
         self._mission, self._first, self._begin_ns = -1, 0, 0

@@ -59,11 +59,7 @@ class SimulatedSession:
 
 
 class SessionSimulator:
-    """The world of a scenario, in which any of its sessions can be simulated by itself.
-
-    Attributes:
-        world: The world that all sessions share.
-    """
+    """The world of a scenario, in which any of its sessions can be simulated by itself."""
 
     def __init__(self, scenario: Scenario) -> None:
         """Make the world.
@@ -73,6 +69,7 @@ class SessionSimulator:
         """
         seeds = scenario.seeds
         self._scenario = scenario
+        # the world that all sessions share
         self.world = make_world(scenario.world, _generator(seeds.world, _WORLD))
         if scenario.changes.are_any:
             if scenario.lidar.rate_hz > 0.0 or scenario.images.render:

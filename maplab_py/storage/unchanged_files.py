@@ -27,19 +27,13 @@ class _File:
 
 
 class WrittenFiles:
-    """Content of the files of a folder when it was saved last.
-
-    Attributes:
-        partition: Which entities come into one file.
-        reused: How many files the last save took over.
-        measurements: Digests of the measurements in them.
-    """
+    """Content of the files of a folder when it was saved last."""
 
     def __init__(self, partition: Partition = STABLE) -> None:
         """Start without files: the first save writes all."""
-        self.partition = partition
-        self.reused = 0
-        self.measurements = ColumnDigests()
+        self.partition = partition  # which entities come into one file
+        self.reused = 0  # how many files the last save took over
+        self.measurements = ColumnDigests()  # digests of the measurements in them
         self._files: dict[bytes, _File] = {}
 
     def find(self, key: bytes) -> _File | None:
@@ -53,22 +47,17 @@ class WrittenFiles:
 
 
 class TakenOver:
-    """The files of one save.
-
-    Attributes:
-        partition: Which entities come into one file.
-        checksums: SHA-256 of the files (paths in the folder) that were taken over.
-        linked: Those that are links, so that their content is on disk.
-    """
+    """The files of one save."""
 
     def __init__(self, before: WrittenFiles, folder: Path, *, compress: bool) -> None:
         """Write to a folder what `before` does not have.
 
         Without `compress`, files that were compressed before are taken over as well.
         """
-        self.partition = before.partition
+        self.partition = before.partition  # which entities come into one file
+        # SHA-256 of the files (paths in the folder) that were taken over
         self.checksums: dict[str, str] = {}
-        self.linked: set[Path] = set()
+        self.linked: set[Path] = set()  # those that are links, so that their content is on disk
         self._measurements = ColumnDigests(before.measurements)
         self._before, self._folder = before, folder
         self._packings = (_COMPRESSED,) if compress else (_STORED, _COMPRESSED)

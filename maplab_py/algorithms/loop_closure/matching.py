@@ -192,12 +192,7 @@ query and search, or per match of a map of many missions."""
 
 
 class SearchMemory:
-    """Results of the latest searches; threads may share it.
-
-    Attributes:
-        max_bytes: The oldest results are dropped where all together take more; None = a share of the
-            memory that is available then.
-    """
+    """Results of the latest searches; threads may share it."""
 
     def __init__(self, max_bytes: int | None = None) -> None:
         """Create an empty memory.
@@ -205,6 +200,8 @@ class SearchMemory:
         Args:
             max_bytes: Memory of all results [bytes].
         """
+        # the oldest results are dropped where all together take more; None = a share of the memory that is
+        # available then
         self.max_bytes = max_bytes
         self._lock = threading.Lock()
         self._rows: OrderedDict[Hashable, I32] = OrderedDict()

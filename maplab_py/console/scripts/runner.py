@@ -34,16 +34,12 @@ logger = logging.getLogger(__name__)
 
 
 class Runner:
-    """Runs lines in a session and shows what came out.
-
-    Attributes:
-        wants_exit: The user has asked to leave.
-    """
+    """Runs lines in a session and shows what came out."""
 
     def __init__(self, session: Session, terminal: output.ConsoleTerminal) -> None:
         self.session = session
         self.terminal = terminal
-        self.wants_exit = False
+        self.wants_exit = False  # the user has asked to leave
         self._alias_depth = 0
         self._rescue: Rescue | None = None  # of a script
         self._plan: costs.Plan | None = None

@@ -136,15 +136,11 @@ class NotedInterrupts:
     """A handler of Ctrl-C that only notes it, for the next command.
 
     An exception may fall into a destructor, where Python ignores it with a message.
-
-    Attributes:
-        is_noted: Ctrl-C was pressed.
-        instead: Called instead of noting it.
     """
 
     def __init__(self) -> None:
-        self.is_noted = False
-        self.instead: Callable[[], None] | None = None
+        self.is_noted = False  # Ctrl-C was pressed
+        self.instead: Callable[[], None] | None = None  # called instead of noting it
 
     def __call__(self, signal_number: int, frame: FrameType | None) -> None:  # noqa: ARG002
         """Note it."""

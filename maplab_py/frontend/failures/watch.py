@@ -72,11 +72,7 @@ class SensorFailure:
 
 
 class SensorWatch:
-    """Watches cameras and IMU of a running odometry.
-
-    Attributes:
-        failures: All of them, the earliest first.
-    """
+    """Watches cameras and IMU of a running odometry."""
 
     def __init__(self, device: RecordedSensors, imu: Imu) -> None:
         """Watch the sensors of a device; nothing has failed."""
@@ -84,7 +80,7 @@ class SensorWatch:
         self._count = len(device.cameras)
         self._images = [ImageWatch() for _ in device.cameras]
         self._samples = SampleWatch()
-        self.failures: list[SensorFailure] = []
+        self.failures: list[SensorFailure] = []  # all of them, the earliest first
         self._open: dict[str, SensorFailure] = {}
         self._returns = 0
         self.restart(0)

@@ -69,11 +69,7 @@ _SEEK_MARGIN_NS = 5_000_000_000
 
 
 class BagRecording:
-    """Reads a bag.
-
-    Attributes:
-        first_sizes_px: Width and height of the first image of cameras, where it can be read.
-    """
+    """Reads a bag."""
 
     def __init__(
         self,
@@ -97,6 +93,7 @@ class BagRecording:
         """
         self.name, self.device, self._path, self._reading = str(path), device, path, reading
         self._bits = [CONTAINER_BITS] * len(device.cameras)
+        # width and height of the first image of cameras, where it can be read
         self.first_sizes_px: dict[int, tuple[int, int]] = {}
         self._clocks: list[ClockFilter[Any]] = []
         self._is_apart = False

@@ -52,20 +52,15 @@ class Run:
 
 
 class ClockFilter(Generic[T]):
-    """Passes items of one sensor whose stamps increase, in the order of arrival.
-
-    Attributes:
-        part: Number of the clock's run, from 0.
-        dropped: Items that were left out.
-        first: The first of them.
-        restart: Stamps after and before the last start of the clock.
-    """
+    """Passes items of one sensor whose stamps increase, in the order of arrival."""
 
     def __init__(self, first_ns: int | None = None) -> None:
         """Start; stamps before `first_ns` are left out."""
+        # dropped: items that were left out
+        # part: number of the clock's run, from 0
         self.part, self.dropped = 0, 0
-        self.first: Dropped | None = None
-        self.restart: Dropped | None = None
+        self.first: Dropped | None = None  # the first of them
+        self.restart: Dropped | None = None  # stamps after and before the last start of the clock
         self._first_ns = first_ns
         self._last_ns = None if first_ns is None else first_ns - 1
         self._waiting: list[tuple[int, T]] = []  # out of line: late, or the beginning of a part

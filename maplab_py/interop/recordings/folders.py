@@ -238,17 +238,13 @@ class FolderRecording:
 
 
 class _Table:
-    """Stamps of one sensor, divided where its clock starts again.
-
-    Attributes:
-        order: Row of the file of each stamp.
-    """
+    """Stamps of one sensor, divided where its clock starts again."""
 
     def __init__(
         self, path: Path, stamps_ns: I64, lines: I64, note: str, time_offset_ns: int = 0
     ) -> None:
         self._path, self.name = path, path.parent.name
-        self.order = clocks.order_of_time(stamps_ns)
+        self.order = clocks.order_of_time(stamps_ns)  # row of the file of each stamp
         is_sorted = bool(np.all(np.diff(self.order) == 1))
         sorting = "" if is_sorted else f"{path}: rows are not in the order of time: they are sorted"
         self.note = "; ".join(filter(None, (note, sorting)))
@@ -357,11 +353,7 @@ class _ImuTable(_Table):
 
 
 class _ImageTable(_Table):
-    """The images of one camera: stamps and file names.
-
-    Attributes:
-        missing: Files that are not there.
-    """
+    """The images of one camera: stamps and file names."""
 
     def __init__(self, folder: Path, camera: Camera, reading: options.ReadingOptions) -> None:
         if not folder.is_dir():
@@ -384,6 +376,7 @@ class _ImageTable(_Table):
                 f"cannot read {self._folder}: {error.strerror}: copy the images there"
             ) from error
         is_there = np.array([name in present for name in self._files])
+        # files that are not there
         self.missing = [self._folder / self._files[k] for k in np.flatnonzero(~is_there)]
         if self.missing and reading.skip_missing_images:
             self.parts = [rows[is_there[rows]] for rows in self.parts]

@@ -40,18 +40,14 @@ class _Node:
 
 
 class Nodes:
-    """The nodes of one scene on a server.
-
-    Attributes:
-        point_scale: Factor on the size of all points.
-    """
+    """The nodes of one scene on a server."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
         self._nodes: dict[_NodeKey, _Node] = {}
         self._ground: list[Any] = []
         self._is_ground_visible = True
-        self.point_scale = 1.0
+        self.point_scale = 1.0  # factor on the size of all points
 
     def show(self, scene: Scene, layers: set[str], missions: set[str]) -> int:
         """Send what differs from what is drawn; return the number of nodes that were sent.

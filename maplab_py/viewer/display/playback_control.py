@@ -28,18 +28,14 @@ logger = logging.getLogger(__name__)
 
 
 class Playback:
-    """Playback, if there is one.
-
-    Attributes:
-        player: The nodes of the steps; None while the whole map is shown.
-        options: How missions are played.
-    """
+    """Playback, if there is one."""
 
     def __init__(self, viewer: Viewer) -> None:
         self._viewer = viewer
         self.time_line = TimeLine(viewer, self)
+        # the nodes of the steps; None while the whole map is shown
         self.player: Player | None = None
-        self.options = PlaybackOptions()
+        self.options = PlaybackOptions()  # how missions are played
         self._ride = FREE
         self._mission = -1  # row whose plots are shown, -1 = the first that is played
         self._signals: tuple[Signal, ...] = ()

@@ -204,21 +204,16 @@ class Selections:
     """Selections of all pages.
 
     A page selects for itself, the console for all pages and for those that will be opened.
-
-    Attributes:
-        newest: Selection that was changed last.
-        pages: Selections of open pages by their number.
-        on_pick: Told the id of each pick.
     """
 
     def __init__(self, viewer: Viewer, folder: Any) -> None:
         """Give every page its widgets in a folder of the panel."""
         self._viewer, self._folder = viewer, folder
         self._general = Selection()
-        self.pages: dict[int, Selection] = {}
+        self.pages: dict[int, Selection] = {}  # selections of open pages by their number
         self._live: U8 | None = None
-        self.newest = self._general
-        self.on_pick: Callable[[str], None] = lambda _: None
+        self.newest = self._general  # selection that was changed last
+        self.on_pick: Callable[[str], None] = lambda _: None  # told the id of each pick
         viewer.server.on_client_connect(self._open)
         viewer.server.on_client_disconnect(self._close)
 

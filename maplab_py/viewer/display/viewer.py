@@ -46,20 +46,7 @@ logger = logging.getLogger(__name__)
 
 
 class Viewer:
-    """A running viewer.
-
-    Attributes:
-        lock: Held while a page is served.
-        server: The viser server.
-        scene: What is shown.
-        subject: What it was made of.
-        selections: What each page has selected.
-        show_image: Shows an image (H, W, 3) in the panel.
-        playback: The time line, and what it plays.
-        court: Where closures are judged.
-        motion: Asks for the motion that a calibration lacks.
-        links: Makes and opens links to a view.
-    """
+    """A running viewer."""
 
     def __init__(self, port: int = 8080, *, is_dark: bool = False) -> None:
         """Start the server.
@@ -71,24 +58,24 @@ class Viewer:
         Raises:
             UserError: No port is free.
         """
-        self.lock = threading.RLock()
-        self.server = start_server(port, self._go)
+        self.lock = threading.RLock()  # held while a page is served
+        self.server = start_server(port, self._go)  # the viser server
         self._cameras = Cameras(self.server)
         self._nodes = Nodes(self.server)
         self._panel = Panel(self)
-        self.selections = Selections(self, self._panel.selection)
-        self.show_image = self.selections.show_image
+        self.selections = Selections(self, self._panel.selection)  # what each page has selected
+        self.show_image = self.selections.show_image  # shows an image (H, W, 3) in the panel
         self._choices: dict[str, bool] = {}  # layers that the user has switched
         self._hidden: set[str] = set()  # ids of missions that the user has hidden
-        self.playback = Playback(self)
+        self.playback = Playback(self)  # the time line, and what it plays
         self._time_machine = TimeMachine(self)
-        self.court = Court(self)
-        self.motion = MotionRequest(self)
-        self.links = Links(self, self._panel.view)
+        self.court = Court(self)  # where closures are judged
+        self.motion = MotionRequest(self)  # asks for the motion that a calibration lacks
+        self.links = Links(self, self._panel.view)  # makes and opens links to a view
         self._themes = Themes(self, self._panel.view, is_dark=is_dark)
         self._drawing: Drawing | None = None
-        self.scene: Scene | None = None
-        self.subject: Subject | None = None
+        self.scene: Scene | None = None  # what is shown
+        self.subject: Subject | None = None  # what it was made of
         self._pending: Subject | None = None
         self._building: Subject | None = None
         self._wake = threading.Event()
