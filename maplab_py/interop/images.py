@@ -102,60 +102,7 @@ def encoding_of(name: str, image: str) -> Encoding:
     return encoding
 
 
-def check_raw(
-    name: str, encoding: str, width_px: int, height_px: int, step: int, size: int
-) -> Encoding:
-    """Return the encoding of a raw image whose data are complete.
-
-    Raises:
-        MapError: It is unknown, or rows or data (size [bytes]) are too short.
-    """
-    described = encoding_of(encoding, name)
-    row_bytes = width_px * described.channels * np.dtype(described.type).itemsize
-    rows = round(height_px * described.planes)
-    step = step or row_bytes  # some drivers do not set it
-    if step < row_bytes or size < step * rows:
-        raise MapError(
-            f"{name}: the image is truncated: {size} bytes in rows of {step}, {row_bytes * rows} are needed; "
-            f"{REMEDY}"
-        )
-    return described
-
-
-def raw_pixels(
-    name: str,
-    encoding: str,
-    width_px: int,
-    height_px: int,
-    step: int,
-    data: Any,
-    *,
-    is_big_endian: bool = False,
-) -> Pixels:
-    """Return the pixels of a raw image: (H, W) grey or (H, W, 3) BGR, 8 or 16 bits.
-
-    Args:
-        name: Of the image, for messages.
-        encoding: Name in ROS.
-        step: Bytes of a row.
-        is_big_endian: Words of 16 bits begin with the upper byte.
-
-    Raises:
-        MapError: As `check_raw`.
-    """
-    described = check_raw(name, encoding, width_px, height_px, step, len(data))
-    rows = round(height_px * described.planes)
-    step = step or len(data) // rows
-    stored = np.frombuffer(data, dtype=np.uint8, count=step * rows).reshape(rows, step)
-    dtype = np.dtype(described.type).newbyteorder(">" if is_big_endian else "<")
-    stored = np.ascontiguousarray(stored[:, : width_px * described.channels * dtype.itemsize])
-    pixels: Any = stored.view(dtype).astype(described.type, copy=False)
-    if described.channels > 1:
-        pixels = pixels.reshape(rows, width_px, described.channels)
-    return _converted(pixels, described.code, name)
-
-
-def _converted(pixels: Any, code: str, name: str) -> Pixels:
+def converted(pixels: Any, code: str, name: str) -> Pixels:
     """Return pixels after a colour conversion of OpenCV."""
     import cv2
 
@@ -169,32 +116,6 @@ def _converted(pixels: Any, code: str, name: str) -> Pixels:
             f"{name}: an image of this size cannot be in {code.split('2', maxsplit=1)[0]}"
         ) from error
     return converted
-
-
-def encoded_pixels(name: str, data: bytes, form: str = "") -> Pixels:
-    """Return the pixels of a PNG or JPEG image; see `raw_pixels`.
-
-    Args:
-        name: Of the image, for messages.
-        form: `format` of a CompressedImage, as in "bayer_rggb8; png compressed".
-
-    Raises:
-        MapError: The image is damaged, or is a video, depths or of 32 bits.
-    """
-    import cv2
-
-    encoded_size(name, data, form)
-    flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    pixels: Any = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
-    if pixels is None:
-        raise MapError(f"{name}: the image is damaged; {REMEDY}")
-    if pixels.dtype not in (np.uint8, np.uint16):
-        raise MapError(f"{name}: pixels of type {pixels.dtype} are not supported: use 8 or 16 bits")
-    source = form.split(";", maxsplit=1)[0].strip().lower()
-    if pixels.ndim == 2 and source.startswith("bayer_"):  # the transport stores the mosaic
-        return _converted(pixels, encoding_of(source, name).code, name)
-    checked: Pixels = pixels
-    return checked
 
 
 def encoded_size(name: str, data: bytes, form: str = "") -> tuple[int, int]:

@@ -1,5 +1,6 @@
 """Pixels of every encoding: converted, or refused by name."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -8,6 +9,7 @@ import pytest
 
 from maplab_py.errors import MapError
 from maplab_py.interop import images
+from maplab_py.interop.recordings.images import EncodedImage, RawImage
 
 HEIGHT, WIDTH = 48, 64
 PATTERNS = {"rggb": "RGGB", "bggr": "BGGR", "gbrg": "GBRG", "grbg": "GRBG"}
@@ -29,11 +31,22 @@ def mosaic(image: np.ndarray, pattern: str) -> np.ndarray:
     return raw
 
 
+CAMERA: Any = SimpleNamespace(width_px=WIDTH, height_px=HEIGHT)
+
+
+def raw(encoding: str, step: int, data: bytes, *, is_big_endian: bool = False) -> Any:
+    return RawImage("image", CAMERA, encoding, WIDTH, HEIGHT, step, is_big_endian, data).decode()
+
+
+def encoded(data: bytes, form: str) -> Any:
+    return EncodedImage("image", CAMERA, lambda: data, form).decode()
+
+
 def read(encoding: str, stored: np.ndarray, padding: int = 6, **options: Any) -> np.ndarray:
     rows = np.ascontiguousarray(stored).view(np.uint8).reshape(stored.shape[0], -1)
     rows = np.pad(rows, ((0, 0), (0, padding)))
     data = rows.tobytes()
-    return images.raw_pixels("image", encoding, WIDTH, HEIGHT, rows.shape[1], data, **options)
+    return raw(encoding, rows.shape[1], data, **options)
 
 
 @pytest.mark.parametrize("pattern", PATTERNS)
@@ -98,11 +111,11 @@ def test_values_beyond_a_given_range_become_white() -> None:
 
 def test_compressed_mosaics() -> None:
     data = cv2.imencode(".png", mosaic(scene(), "RGGB"))[1].tobytes()
-    pixels = images.encoded_pixels("image", data, "bayer_rggb8; png compressed ")
+    pixels = encoded(data, "bayer_rggb8; png compressed ")
     assert np.abs(pixels[2:-2, 2:-2].astype(int) - scene()[2:-2, 2:-2]).max() <= 6
-    assert images.encoded_pixels("image", data, "mono8; png compressed ").ndim == 2
+    assert encoded(data, "mono8; png compressed ").ndim == 2
     colours = cv2.imencode(".jpg", scene())[1].tobytes()
-    assert images.encoded_pixels("image", colours, "bayer_rggb8; jpeg compressed bgr8").ndim == 3
+    assert encoded(colours, "bayer_rggb8; jpeg compressed bgr8").ndim == 3
 
 
 @pytest.mark.parametrize(
@@ -120,7 +133,7 @@ def test_compressed_mosaics() -> None:
 )
 def test_other_messages_are_named(data: bytes, form: str, words: str) -> None:
     with pytest.raises(MapError, match=words):
-        images.encoded_pixels("image", data, form)
+        encoded(data, form)
 
 
 @pytest.mark.parametrize("name", ["32FC1", "64FC3", "mono12p", "8UC2", ""])
@@ -132,4 +145,4 @@ def test_unknown_encodings_are_named(name: str) -> None:
 def test_short_data_are_refused_for_every_encoding() -> None:
     for name in images.ENCODINGS:
         with pytest.raises(MapError, match="truncated"):
-            images.raw_pixels("image", name, WIDTH, HEIGHT, WIDTH, bytes(WIDTH * HEIGHT - 1))
+            raw(name, WIDTH, bytes(WIDTH * HEIGHT - 1))

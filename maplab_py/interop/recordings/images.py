@@ -6,6 +6,9 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from maplab_py.array_types import U8
 from maplab_py.errors import MapError, os_errors_as
 from maplab_py.input_files import read_bytes
 from maplab_py.interop import images as pixel_data
@@ -26,7 +29,7 @@ class EncodedImage:
 
     def check(self) -> None:
         """Check size and completeness; see `ImageData.check`."""
-        self._checked_bytes()
+        self._whole()
 
     def size_px(self) -> tuple[int, int]:
         """Return width and height as recorded.
@@ -38,7 +41,20 @@ class EncodedImage:
 
     def decode(self) -> pixel_data.Pixels:
         """Return the pixels; see `ImageData.decode`."""
-        return pixel_data.encoded_pixels(self.name, self._checked_bytes(), self.form)
+        import cv2
+
+        flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
+        pixels: Any = cv2.imdecode(np.frombuffer(self._whole(), dtype=np.uint8), flags)
+        if pixels is None:
+            raise MapError(f"{self.name}: the image is damaged; {pixel_data.REMEDY}")
+        if pixels.dtype not in (np.uint8, np.uint16):
+            raise MapError(
+                f"{self.name}: pixels of type {pixels.dtype} are not supported: use 8 or 16 bits"
+            )
+        source = self.form.split(";", maxsplit=1)[0].strip().lower()
+        is_mosaic = pixels.ndim == 2 and source.startswith("bayer_")  # the transport stores it so
+        code = pixel_data.encoding_of(source, self.name).code if is_mosaic else ""
+        return pixel_data.converted(pixels, code, self.name)
 
     @property
     def encoding(self) -> str:
@@ -59,7 +75,7 @@ class EncodedImage:
         """Bits of a value; 0 = not known without looking at the values."""
         return 0 if pixel_data.has_16_bits(self.read()) else 8
 
-    def _checked_bytes(self) -> bytes:
+    def _whole(self) -> bytes:
         data = self.read()
         width, height = pixel_data.encoded_size(self.name, data, self.form)
         check_size(self.name, self.camera, width, height)
@@ -86,21 +102,35 @@ class RawImage:
     def check(self) -> None:
         """Check size and completeness; see `ImageData.check`."""
         check_size(self.name, self.camera, self.width_px, self.height_px)
-        size = self.width_px, self.height_px
-        pixel_data.check_raw(self.name, self.encoding, *size, self.step, len(self.data))
+        self._rows()
 
     def decode(self) -> pixel_data.Pixels:
         """Return the pixels; see `ImageData.decode`."""
-        self.check()
-        return pixel_data.raw_pixels(
-            self.name,
-            self.encoding,
-            self.width_px,
-            self.height_px,
-            self.step,
-            self.data,
-            is_big_endian=self.is_big_endian,
-        )
+        check_size(self.name, self.camera, self.width_px, self.height_px)
+        described, stored = self._rows()
+        dtype = np.dtype(described.type).newbyteorder(">" if self.is_big_endian else "<")
+        pixels: Any = np.ascontiguousarray(stored).view(dtype).astype(described.type, copy=False)
+        if described.channels > 1:
+            pixels = pixels.reshape(len(stored), self.width_px, described.channels)
+        return pixel_data.converted(pixels, described.code, self.name)
+
+    def _rows(self) -> tuple[pixel_data.Encoding, U8]:
+        """Return the encoding, and the bytes of the rows (rows, bytes).
+
+        Raises:
+            MapError: The encoding is unknown, or rows or data are too short.
+        """
+        described, size = pixel_data.encoding_of(self.encoding, self.name), len(self.data)
+        row_bytes = self.width_px * described.channels * np.dtype(described.type).itemsize
+        rows = round(self.height_px * described.planes)
+        step = self.step or size // rows  # some drivers do not set it
+        if step < row_bytes or size < step * rows:
+            raise MapError(
+                f"{self.name}: the image is truncated: {size} bytes in rows of {step}, {row_bytes * rows} "
+                f"are needed; {pixel_data.REMEDY}"
+            )
+        stored = np.frombuffer(self.data, dtype=np.uint8, count=step * rows).reshape(rows, step)
+        return described, stored[:, :row_bytes]
 
     @property
     def bits(self) -> int:
