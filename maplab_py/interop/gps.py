@@ -390,7 +390,10 @@ def read_gps_bag(path: Path, topic: str = "") -> GpsTrack:
     stamps: list[int] = []
     reasons: list[str] = []
     with bag_files.opened_bag(path) as reader:
-        name = _chosen(path, bag_files.topic_types(reader), topic)
+        types = bag_files.topic_types(reader)
+        fixes_of = sorted(name for name, kind in types.items() if kind == NAV_SAT_FIX)
+        asked = topic or (fixes_of[0] if len(fixes_of) == 1 else "")
+        name = bag_files.topic_in_bag(path, types, asked, "--gps_topic", (NAV_SAT_FIX,))
         connections = [c for c in reader.connections if c.topic == name]
         for connection, _, data in bag_files.all_messages(path, reader, connections):
             message: Any = reader.deserialize(data, connection.msgtype)
@@ -401,23 +404,4 @@ def read_gps_bag(path: Path, topic: str = "") -> GpsTrack:
     fixes = np.array(rows, dtype=np.float64).reshape(-1, 3)
     return gps_track(
         np.array(stamps, dtype=np.int64), fixes, f"{path}: {name}", np.array(reasons, dtype=np.str_)
-    )
-
-
-def _chosen(path: Path, types: dict[str, str], topic: str) -> str:
-    fixes = sorted(name for name, kind in types.items() if kind == NAV_SAT_FIX)
-    wanted = [name for name in fixes if topic in ("", name)]
-    if len(wanted) == 1:
-        return wanted[0]
-    if topic:
-        what = f"is of type {types[topic]}" if topic in types else "is not in it"
-        raise UserError(
-            f"{path}: the topic --gps_topic={topic} {what}; topics: {bag_files.listed_topics(types)}"
-        )
-    if not fixes:
-        raise UserError(
-            f"{path}: no topic has sensor_msgs/NavSatFix; topics: {bag_files.listed_topics(types)}"
-        )
-    raise UserError(
-        f"{path}: several topics have fixes: choose with --gps_topic: {', '.join(fixes)}"
     )

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from maplab_py.array_types import F32, F64, I64
+from maplab_py.array_types import F32, I64
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.bags.options import BagImport, BagImportOptions
 from maplab_py.interop.bags.sensor_messages import CAMERA_INFO, CLOUD, COMPRESSED, IMAGE, cloud_of
+from maplab_py.interop.calibrations.single_cameras import read_camera_info
 from maplab_py.interop.images import CONTAINER_BITS, sampled
 from maplab_py.interop.ply import PlyCloud
 from maplab_py.interop.recordings import bag_files, protocol
@@ -22,24 +23,14 @@ from maplab_py.interop.resources import matching, point_clouds
 from maplab_py.interop.resources.depth_maps import MM_PER_M, RAW_DEPTH_MAPS, encoded_depth
 from maplab_py.interop.resources.images import RAW_COLOUR, RAW_GREY, add_image
 from maplab_py.progress import SILENT, Progress
-from maplab_py.sensors import Camera, Distortion, Projection, projection
+from maplab_py.sensors import Camera, projection
+from maplab_py.sensors.yaml_entry import Entry
 from maplab_py.storage.resources.new import NewResources
 from maplab_py.vimap import VIMap, mission_labels
 
 if TYPE_CHECKING:
     from maplab_py.interop.recordings.bag_files import BagReader
 
-_MODELS = {
-    "": Distortion.NONE,
-    "none": Distortion.NONE,
-    "plumb_bob": Distortion.RADTAN,
-    "rational_polynomial": Distortion.RADTAN,
-    "radtan": Distortion.RADTAN,
-    "equidistant": Distortion.EQUIDISTANT,
-    "fisheye": Distortion.EQUIDISTANT,
-    "fov": Distortion.FOV,
-}
-_SIZES = {Distortion.NONE: 0, Distortion.RADTAN: 4, Distortion.EQUIDISTANT: 4, Distortion.FOV: 1}
 _GRID = 9  # pixels of a row and of a column that are compared
 
 
@@ -58,7 +49,10 @@ def check_camera_info(message: Any, name: str, camera: Camera, tolerance_px: flo
         MapError: The message has no calibration, or a model that cameras of maps do not have.
         UserError: It is the calibration of another camera.
     """
-    told = camera_of_info(message, name, camera)
+    fields = {key.lower(): value for key, value in vars(message).items()}  # ROS 1 has capitals
+    keys = ("k", "d", "distortion_model", "width", "height")
+    content = {key: np.asarray(fields[key]).tolist() for key in keys}
+    (told,) = read_camera_info(Entry(content, name)).cameras
     if (told.width_px, told.height_px) != (camera.width_px, camera.height_px):
         raise UserError(
             f"{name}: its images are {told.width_px} x {told.height_px}, those of the map's camera "
@@ -72,40 +66,6 @@ def check_camera_info(message: Any, name: str, camera: Camera, tolerance_px: flo
             "rectified, or give a larger --calibration_tolerance_px"
         )
     return distance_px
-
-
-def camera_of_info(message: Any, name: str, like: Camera) -> Camera:
-    """Return a camera with the calibration of a CameraInfo.
-
-    Raises:
-        MapError: The message has no calibration, or a model that cameras of maps do not have.
-    """
-    K, D = _field(message, "k"), _field(message, "d")
-    if K.size != 9 or not np.isfinite(K).all() or K[0] <= 0.0 or K[4] <= 0.0:
-        raise MapError(f"{name}: the camera is not calibrated: K has no focal lengths")
-    model = _MODELS.get(message.distortion_model.lower())
-    if model is None:
-        raise MapError(
-            f"{name}: the distortion model {message.distortion_model} is not supported: leave "
-            "--camera_calibration_topic away"
-        )
-    if not D.any() and model is not Distortion.FOV:
-        model = Distortion.NONE
-    size = _SIZES[model]
-    if len(D) < size or D[size:].any():
-        raise MapError(
-            f"{name}: {message.distortion_model} with {len(D)} coefficients is not supported, "
-            f"{size} are: leave out --camera_calibration_topic"
-        )
-    return dataclasses.replace(
-        like,
-        projection=Projection.PINHOLE,
-        distortion=model,
-        intrinsics=K[[0, 4, 2, 5]],
-        distortion_parameters=D[:size],
-        width_px=int(message.width),
-        height_px=int(message.height),
-    )
 
 
 def largest_distance_px(first: Camera, second: Camera) -> float:
@@ -122,14 +82,6 @@ def largest_distance_px(first: Camera, second: Camera) -> float:
     if not both.any():
         return float("inf")
     return float(np.max(np.linalg.norm(seen[both] - uv[both], axis=1)))
-
-
-def _field(message: Any, name: str) -> F64:
-    """Return an array of a CameraInfo; ROS 1 spells the names with capitals."""
-    values = getattr(message, name, None)
-    if values is None:
-        values = getattr(message, name.upper())
-    return np.asarray(values, dtype=np.float64).reshape(-1)
 
 
 _DEPTH_ENCODINGS = ("16UC1", "32FC1")
@@ -198,7 +150,8 @@ def import_bag_resources(
 
 def _opened_topic(path: Path, reader: BagReader, asked: str) -> _Topic:
     types = bag_files.topic_types(reader)
-    topic = _name_in_bag(path, types, asked, "--resource_topic", (IMAGE, COMPRESSED, CLOUD))
+    wanted = (IMAGE, COMPRESSED, CLOUD)
+    topic = bag_files.topic_in_bag(path, types, asked, "--resource_topic", wanted)
     stamps = [
         bag_files.header_stamp_ns(data, is_ros_2=reader.is2)
         for _, data in _messages(path, reader, topic)
@@ -213,29 +166,6 @@ def _opened_topic(path: Path, reader: BagReader, asked: str) -> _Topic:
             "message before it: correct it, or leave the message out with `rosbag filter`"
         )
     return _Topic(path, reader, topic, types[topic], stamps_ns)
-
-
-def _name_in_bag(
-    path: Path, types: dict[str, str], asked: str, flag: str, wanted: tuple[str, ...]
-) -> str:
-    """Return the bag's name of a topic.
-
-    Raises:
-        UserError: It is not given, not there, or of another type.
-    """
-    usable = bag_files.listed_topics(
-        {topic: kind for topic, kind in types.items() if kind in wanted}
-    )
-    topic = next((t for t in types if asked and t.strip("/") == asked.strip("/")), None)
-    if topic is None:
-        problem = f"there is no topic {asked}" if asked else "no topic is given"
-        raise UserError(f"{path}: {problem}: give {flag}; the bag has {usable}")
-    if types[topic] not in wanted:
-        raise UserError(
-            f"{path}: {topic} has messages of type {types[topic]}: give another {flag}; the bag has "
-            f"{usable}"
-        )
-    return topic
 
 
 def _messages(path: Path, reader: BagReader, topic: str) -> Iterator[tuple[str, bytes]]:
@@ -315,7 +245,7 @@ def _calibration_difference(
     if not asked:
         return None
     types = bag_files.topic_types(topic.reader)
-    name = _name_in_bag(topic.path, types, asked, flag, (CAMERA_INFO,))
+    name = bag_files.topic_in_bag(topic.path, types, asked, flag, (CAMERA_INFO,))
     for type_, data in _messages(topic.path, topic.reader, name):
         message = topic.reader.deserialize(data, type_)
         full_name = f"{topic.path}: {name}"

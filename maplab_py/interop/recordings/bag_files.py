@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -273,6 +273,44 @@ def topic_types(reader: BagReader) -> dict[str, str]:
 def listed_topics(types: dict[str, str]) -> str:
     """Return topics and types in one line."""
     return ", ".join(f"{topic} ({kind})" for topic, kind in sorted(types.items())) or "none"
+
+
+def topic_in_bag(
+    path: Path,
+    types: dict[str, str],
+    asked: str,
+    flag: str,
+    wanted: Sequence[str],
+    sensor: str = "",
+) -> str:
+    """Return the bag's name of a topic.
+
+    Args:
+        types: Types of the topics of the bag.
+        asked: Name as it was given; empty = none was.
+        flag: Flag that names it.
+        wanted: Types that it may have.
+        sensor: What its messages are of, for messages.
+
+    Raises:
+        UserError: It is not given, not there, or of another type.
+    """
+    usable = {topic: kind for topic, kind in types.items() if kind in wanted}
+    known, owner = f"the bag has {listed_topics(usable or types)}", f" of {sensor}" * bool(sensor)
+    topic = next((t for t in types if asked and t.strip("/") == asked.strip("/")), None)
+    if topic is None and not usable:
+        raise UserError(f"{path}: no topic has {' or '.join(wanted)}; {known}")
+    if topic is None:
+        problem = f"there is no topic {asked}{owner}" if asked else f"no topic{owner} is given"
+        raise UserError(f"{path}: {problem}: give {flag}; {known}")
+    if topic not in usable:
+        is_video = any(word in types[topic].lower() for word in ("video", "ffmpeg"))
+        hint = " (a video: decode it to images first, as with `image_transport republish`)"
+        raise UserError(
+            f"{path}: {topic} has messages of type {types[topic]}{hint if is_video else ''}, wanted is "
+            f"{' or '.join(wanted)}: give {flag}; {known}"
+        )
+    return topic
 
 
 def _check_databases(path: Path) -> None:

@@ -25,8 +25,8 @@ from maplab_py.interop.recordings.bag_files import (
     damage_named,
     header_stamp_ns,
     imu_sample,
-    listed_topics,
     opened_bag,
+    topic_in_bag,
     topic_types,
 )
 from maplab_py.interop.recordings.clocks import (
@@ -418,26 +418,14 @@ class BagRecording:
         sensor = f"camera {stream.camera}" if stream.camera >= 0 else "IMU"
         flag = "--camera_topics" if stream.camera >= 0 else "--imu_topic"
         types = topic_types(reader)
-        present = listed_topics(types)
-        if not stream.topic:
-            raise UserError(
-                f"{self._path}: the calibration names no topic of {sensor}: give {flag}; the bag "
-                f"has {present}"
-            )
-        topic = next((t for t in types if t.strip("/") == stream.topic.strip("/")), None)
-        if topic is None:
-            raise UserError(
-                f"{self._path}: there is no topic {stream.topic} ({sensor}): give {flag}; the bag "
-                f"has {present}"
-            )
-        wanted = IMAGE_TYPES if stream.camera >= 0 else (IMU_TYPE,)
-        if types[topic] not in wanted:
-            is_video = any(word in types[topic].lower() for word in ("video", "ffmpeg"))
-            hint = " (a video: decode it to images first, as with `image_transport republish`)"
-            raise UserError(
-                f"{self._path}: {topic} has messages of type {types[topic]}{hint if is_video else ''}, "
-                f"{sensor} needs {' or '.join(wanted)}: give {flag}; the bag has {present}"
-            )
+        topic = topic_in_bag(
+            self._path,
+            types,
+            stream.topic,
+            flag,
+            IMAGE_TYPES if stream.camera >= 0 else (IMU_TYPE,),
+            sensor,
+        )
         connections = [c for c in reader.connections if c.topic == topic]
         arrivals_ns: list[int] = []
         stamps_ns: list[int] = []

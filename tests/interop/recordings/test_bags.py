@@ -134,13 +134,16 @@ def test_topics_of_flags_and_the_time_offset(tmp_path: Path, device: RecordedSen
     [
         (
             {"imu_topic": "/imu"},
-            r"no topic /imu \(IMU\).*bag has /cam0/image_raw \(sensor_msgs/msg/Image\)",
+            r"no topic /imu of IMU: give --imu_topic; the bag has /imu0 \(sensor_msgs/msg/Imu\)",
         ),
         (
             {"camera_topics": "/cam0/image_raw,/left"},
-            r"no topic /left \(camera 1\): give --camera_topics",
+            "no topic /left of camera 1: give --camera_topics",
         ),
-        ({"imu_topic": "/cam0/image_raw"}, "has messages of type sensor_msgs/msg/Image, IMU needs"),
+        (
+            {"imu_topic": "/cam0/image_raw"},
+            "has messages of type sensor_msgs/msg/Image, wanted is sensor_msgs/msg/Imu",
+        ),
         ({"camera_topics": "/cam0/image_raw"}, "names 1 topics, 2 cameras are read"),
         ({"camera_topics": "/cam0/image_raw,/cam0/image_raw"}, "two sensors have the same topic"),
         (
@@ -164,7 +167,7 @@ def test_calibration_without_topics(tmp_path: Path, calibrated: SourceOptions) -
     file.write_text(file.read_text().replace("/imu0", "''"))
     path = write_bag(make_content(), tmp_path / "room.bag")
     with pytest.raises(
-        UserError, match="names no topic of IMU: give --imu_topic; the bag has /cam0"
+        UserError, match="no topic of IMU is given: give --imu_topic; the bag has /imu0"
     ):
         open_recording(path, calibrated)
 
@@ -184,7 +187,7 @@ def test_empty_bags(tmp_path: Path, calibrated: SourceOptions) -> None:
     with pytest.raises(MaplabError, match=r"bare\.bag"):
         open_recording(bare, calibrated)
     blind = write_bag(_without(make_content(), False), tmp_path / "blind.bag")
-    with pytest.raises(UserError, match=r"no topic /cam0/image_raw .*the bag has /imu0"):
+    with pytest.raises(UserError, match=r"no topic has sensor_msgs/msg/Image .*the bag has /imu0"):
         open_recording(blind, calibrated)
 
 
