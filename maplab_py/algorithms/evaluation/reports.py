@@ -67,14 +67,9 @@ class TrajectoryEvaluationReport(Report):
 
     def as_baseline(self, name: str) -> BaselineErrors:
         """Return the errors that a later evaluation is compared with."""
-        return BaselineErrors(
-            name,
-            self.ape_m.rmse,
-            None if self.ape_deg is None else self.ape_deg.rmse,
-            None if self.ape_sim3_m is None else self.ape_sim3_m.rmse,
-            None if self.rpe_m is None else self.rpe_m.rmse,
-            None if self.rpe_deg is None else self.rpe_deg.rmse,
-        )
+        errors = (self.ape_deg, self.ape_sim3_m, self.rpe_m, self.rpe_deg)
+        rmse = (None if error is None else error.rmse for error in errors)
+        return BaselineErrors(name, self.ape_m.rmse, *rmse)
 
     def display(self) -> Any:
         """Return one table of the errors and a sentence on how they were computed."""

@@ -2,6 +2,7 @@
 
 import dataclasses
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 
@@ -28,11 +29,35 @@ class Sights:
     spread_rad: F64  # (L,) largest angle of an observer from there
     nearest_m: F64  # (L,) distances of the observers
     farthest_m: F64  # (L,)
+    turn_rad: float = _TURN_RAD
+
+    @classmethod
+    def of(cls, p_G: F64, landmark: I64, eye_G: F64, turn_rad: float = _TURN_RAD) -> Self:
+        """Return the sights of landmarks (L, 3); the direction of those without observations is 0.
+
+        Args:
+            p_G: Positions.
+            landmark: Landmark (N,) of every observation.
+            eye_G: Positions (N, 3) of the observers.
+            turn_rad: Tolerance on the direction.
+        """
+        toward, count = eye_G - p_G[landmark], len(p_G)
+        distance = np.linalg.norm(toward, axis=1)
+        toward /= np.maximum(distance, 1e-9)[:, None]
+        sums = [np.bincount(landmark, part, minlength=count) for part in toward.T]
+        mean: F64 = np.stack(sums, axis=1)
+        mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
+        cosine, nearest, farthest = np.ones(count), np.full(count, np.inf), np.zeros(count)
+        np.minimum.at(cosine, landmark, np.einsum("ni,ni->n", toward, mean[landmark]))
+        np.minimum.at(nearest, landmark, distance)
+        np.maximum.at(farthest, landmark, distance)
+        spread_rad = np.arccos(np.clip(cosine, -1.0, 1.0))
+        return cls(mean, spread_rad, nearest, farthest, turn_rad)
 
     @cached_property
     def least_cosine(self) -> F64:
         """Cosine (L,) of the largest angle from `direction` from which a landmark may be visible."""
-        return np.asarray(np.cos(np.minimum(self.spread_rad + _TURN_RAD, np.pi)))
+        return np.asarray(np.cos(np.minimum(self.spread_rad + self.turn_rad, np.pi)))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -67,20 +92,7 @@ class LocalizationMap:
     @cached_property
     def sights(self) -> Sights:
         """View directions and distances of each landmark."""
-        start, rows = self.rows_of
-        first, count = start[:-1], np.diff(start)
-        toward = self.p_G_observer[self.observer[rows]] - np.repeat(self.p_G, count, axis=0)
-        distance = np.linalg.norm(toward, axis=1)
-        toward /= np.maximum(distance, 1e-9)[:, None]
-        mean = np.add.reduceat(toward, first, axis=0)
-        mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
-        cosine = np.einsum("ni,ni->n", toward, np.repeat(mean, count, axis=0))
-        return Sights(
-            direction=mean,
-            spread_rad=np.arccos(np.clip(np.minimum.reduceat(cosine, first), -1.0, 1.0)),
-            nearest_m=np.minimum.reduceat(distance, first),
-            farthest_m=np.maximum.reduceat(distance, first),
-        )
+        return Sights.of(self.p_G, self.descriptors.label, self.p_G_observer[self.observer])
 
     @cached_property
     def landmarks_of(self) -> tuple[I64, I64]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from maplab_py.algorithms.landmarks.evidence import Session, session_times_s
 from maplab_py.algorithms.landmarks.sightings import cameras_of
+from maplab_py.algorithms.localization.database import Sights
 from maplab_py.algorithms.loop_closure.features import most_frequent_kind
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.array_types import F64, I64, Mask
@@ -37,37 +38,6 @@ _MIN_MATCHED, _MIN_MATCHED_SHARE = 8, 0.3
 """Landmarks that an image must match, in number and as a share, before it counts that others are missing."""
 _PLACE_M, _SECTORS = 1.0, 8
 """Images of one place: within a cell of that size, in the same of so many directions."""
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Envelopes:
-    """Directions and distances from which landmarks (L,) were observed."""
-
-    direction: F64  # (L, 3) unit, from the landmark to the middle of its observers
-    least_cosine: F64  # (L,)
-    nearest_m: F64  # (L,)
-    farthest_m: F64  # (L,)
-
-
-def envelopes(vi_map: VIMap, keypoints: I64) -> Envelopes:
-    """Return where landmarks were observed from by some keypoints (O,); no direction without any."""
-    landmark = vi_map.keypoints.landmark[keypoints].astype(np.int64)
-    keypoints = keypoints[np.argsort(landmark, kind="stable")]
-    landmark = np.sort(landmark)
-    toward = vi_map.T_G_I[vi_map.keypoint_vertex[keypoints], 4:] - vi_map.p_G[landmark]
-    distance = np.maximum(np.linalg.norm(toward, axis=1), 1e-9)
-    toward /= distance[:, None]
-    count = len(vi_map.landmarks)
-    direction: F64 = np.stack(
-        [np.bincount(landmark, toward[:, axis], minlength=count) for axis in range(3)], axis=1
-    )
-    direction = direction / np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
-    spread, nearest, farthest = np.ones(count), np.full(count, np.inf), np.zeros(count)
-    np.minimum.at(spread, landmark, np.einsum("ni,ni->n", toward, direction[landmark]))
-    np.minimum.at(nearest, landmark, distance)
-    np.maximum.at(farthest, landmark, distance)
-    widest = np.minimum(np.arccos(np.clip(spread, -1.0, 1.0)) + _TURN_RAD, np.pi)
-    return Envelopes(direction, np.cos(widest), nearest / _RANGE, farthest * _RANGE)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -135,7 +105,9 @@ class _Search:
         is_other = vi_map.vertices.mission[vi_map.keypoint_vertex[keypoints]] != mission
         others = keypoints[is_other]
         self._map = vi_map
-        self._envelopes = envelopes(vi_map, others)
+        eyes_G = vi_map.T_G_I[vi_map.keypoint_vertex[others], 4:]
+        landmark = vi_map.keypoints.landmark[others].astype(np.int64)
+        self._sights = Sights.of(vi_map.p_G, landmark, eyes_G, _TURN_RAD)
         self._is_old = np.zeros(len(vi_map.landmarks), dtype=np.bool_)
         self._is_old[vi_map.keypoints.landmark[others]] = True
         self._is_old &= vi_map.landmarks.quality == LandmarkQuality.GOOD
@@ -192,12 +164,13 @@ class _Search:
 
     def _in_reach(self, eye: F64) -> I64:
         """Return the old landmarks that are seen from a place (3,), as far as direction and distance tell."""
-        e, rows = self._envelopes, self._old
+        seen, rows = self._sights, self._old
         toward = eye - self._map.p_G[rows]
         distance = np.linalg.norm(toward, axis=1)
-        cosine = np.einsum("ni,ni->n", toward, e.direction[rows]) / np.maximum(distance, 1e-9)
-        reached = (distance > e.nearest_m[rows]) & (distance < e.farthest_m[rows])
-        return np.asarray(rows[reached & (cosine > e.least_cosine[rows])])
+        cosine = np.einsum("ni,ni->n", toward, seen.direction[rows]) / np.maximum(distance, 1e-9)
+        reached = distance > seen.nearest_m[rows] / _RANGE
+        reached &= distance < seen.farthest_m[rows] * _RANGE
+        return np.asarray(rows[reached & (cosine > seen.least_cosine[rows])])
 
     def _near(self, keypoints: I64, uv: F64) -> tuple[I64, I64]:
         """Return keypoints near pixels (N, 2), as pairs of index and keypoint."""
