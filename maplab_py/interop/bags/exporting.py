@@ -114,10 +114,13 @@ def export_mcap(
     begin_ns = vi_map.vertices.timestamp_ns.min(keepdims=True)
     streams = [*_landmarks(vi_map, maker, begin_ns), *_closures(vi_map, maker, begin_ns)]
     for mission, label in enumerate(labels):
-        streams += _mission(vi_map, maker, mission, label, begin_ns)
-        if images:
-            parts = MissionStreams(vi_map, map_folder, mission, kind, BagExportOptions())
-            streams += [s for s in parts.images(_IMAGES, "image_raw") if s.count]
+        name = "".join(letter if letter.isalnum() else "_" for letter in label)
+        parts = MissionStreams(vi_map, map_folder, mission, kind, BagExportOptions())
+        streams += parts.path(f"/mission_{name}/path", begin_ns) + parts.poses(
+            f"/mission_{name}/pose"
+        )
+        streams += parts.images(_IMAGES, "image_raw") if images else []
+    streams = [stream for stream in streams if stream.count]
     return _write(path, kind, streams, labels, overwrite=overwrite, progress=progress)
 
 
@@ -143,19 +146,20 @@ class MissionStreams:
         self._imu_id = queries.mission_sensor_id(vi_map, mission, MissionSensor.IMU)
         self.notes: list[str] = []
 
-    def poses(self) -> list[MessageStream]:
+    def poses(self, topic: str = "/pose") -> list[MessageStream]:
         """Poses T_G_I."""
         T_G_I = self._map.T_G_I[self._vertices]
         rows = self._maker.poses(self._times_ns, T_G_I, self._options.world_frame)
-        return [_stream("/pose", sensor_messages.POSE, self._times_ns, rows)]
+        return [_stream(topic, sensor_messages.POSE, self._times_ns, rows)]
 
-    def path(self) -> list[MessageStream]:
-        """All poses T_G_I in a message, at the last time."""
+    def path(self, topic: str = "/path", at_ns: I64 | None = None) -> list[MessageStream]:
+        """All poses T_G_I in a message, which arrives at a time; None = the last one."""
         if not len(self._times_ns):
             return []
         T_G_I = self._map.T_G_I[self._vertices]
         row = self._maker.path(self._times_ns, T_G_I, self._options.world_frame)
-        return [_stream("/path", sensor_messages.PATH, self._times_ns[-1:], [row])]
+        arrival_ns = self._times_ns[-1:] if at_ns is None else at_ns
+        return [_stream(topic, sensor_messages.PATH, arrival_ns, [row])]
 
     def odometry(self) -> list[MessageStream]:
         """Poses T_M_I with velocities."""
@@ -272,23 +276,6 @@ def _closures(
     ends: F64 = np.stack([p_G_I[edges.from_vertex], p_G_I[edges.to_vertex]], axis=1)
     row = maker.lines(int(time_ns[0]), _FRAME, "loop closures", ends, _CLOSURE_COLOUR)
     return [_stream("/loop_closures", sensor_messages.LINES, time_ns, [row])]
-
-
-def _mission(
-    vi_map: VIMap, maker: sensor_messages.MessageMaker, mission: int, label: str, begin_ns: I64
-) -> list[MessageStream]:
-    """Return the path of a mission, and its poses at their times."""
-    rows = slice(*vi_map.vertex_start[mission : mission + 2].tolist())
-    times_ns, T_G_I = vi_map.vertices.timestamp_ns[rows], vi_map.T_G_I[rows]
-    if not len(times_ns):
-        return []
-    name = "".join(letter if letter.isalnum() else "_" for letter in label)
-    poses = maker.poses(times_ns, T_G_I, _FRAME)
-    path = maker.path(times_ns, T_G_I, _FRAME)
-    return [
-        _stream(f"/mission_{name}/path", sensor_messages.PATH, begin_ns, [path]),
-        _stream(f"/mission_{name}/pose", sensor_messages.POSE, times_ns, poses),
-    ]
 
 
 def _stream(topic: str, kind: str, times_ns: I64, rows: Iterable[bytes]) -> MessageStream:

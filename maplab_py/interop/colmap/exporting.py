@@ -162,7 +162,11 @@ def model_of_map(
     """
     rows = np.arange(len(vi_map.missions)) if missions is None else missions
     rigs = map_rigs(vi_map, rows)
-    frames = _exported_frames(vi_map, rows)
+    chosen = np.isin(vi_map.vertices.mission[vi_map.frames.vertex], rows)
+    chosen &= is_valid(vi_map.missions.sensor_id[:, MissionSensor.NCAMERA])[
+        vi_map.vertices.mission[vi_map.frames.vertex]
+    ]
+    frames = np.flatnonzero(chosen & vi_map.frames.is_valid & is_valid(vi_map.frames.id))
     if not len(frames):
         raise UserError("the missions have no images that COLMAP could use: choose others")
     cameras, colmap_rigs = _sensors(rigs)
@@ -253,16 +257,6 @@ def image_names(vi_map: VIMap, frames: I64) -> tuple[str, ...]:
         used.add(name)
         names.append(name)
     return tuple(names)
-
-
-def _exported_frames(vi_map: VIMap, missions: I64) -> I64:
-    """Return the rows of frames that have an image."""
-    table = vi_map.frames
-    with_rig = is_valid(vi_map.missions.sensor_id[:, MissionSensor.NCAMERA])
-    chosen = np.zeros(len(vi_map.missions), dtype=np.bool_)
-    chosen[missions] = True
-    of_mission = (chosen & with_rig)[vi_map.vertices.mission[table.vertex]]
-    return np.flatnonzero(of_mission & table.is_valid & is_valid(table.id))
 
 
 def _sensors(

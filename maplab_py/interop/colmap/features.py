@@ -214,14 +214,10 @@ def with_features(
         for kind in (SCALED, UNDISTORTED)
         if (count := sum(part.agreement == kind for part in features))
     ]
-    return _with_landmark_types(vi_map.replace(frames=frames, keypoints=keypoints)), notes
-
-
-def _with_landmark_types(vi_map: VIMap) -> VIMap:
-    """Give each landmark the feature type of its first observation."""
-    first = vi_map.observations[vi_map.observation_start[:-1]]
+    vi_map = vi_map.replace(frames=frames, keypoints=keypoints)
+    first = vi_map.observations[vi_map.observation_start[:-1]]  # tells the type of each landmark
     kind = np.maximum(vi_map.feature_type[first], 0)
-    return vi_map.replace(landmarks=vi_map.landmarks.replace(feature_type=kind))
+    return vi_map.replace(landmarks=vi_map.landmarks.replace(feature_type=kind)), notes
 
 
 def with_images(

@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import interpolation, se3, so3
 from maplab_py.geometry.alignment import apply_similarity, umeyama
@@ -23,7 +23,6 @@ from maplab_py.interop.trajectories import Trajectory, read_trajectory
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import counted
 from maplab_py.vimap import VIMap, to_hex_list
-from maplab_py.vimap.queries import is_metric
 
 
 def import_colmap(
@@ -56,6 +55,9 @@ def import_colmap(
     times_ns = _times(model, side, options)
     bodies = to_map.body_frames(model, times_ns, side)
     placing = _place(model, bodies, options)
+    is_metric = np.full(len(bodies.mission_rig), placing.is_metric, dtype=np.bool_)
+    if not options.scale and not options.gravity:
+        is_metric |= picked(side.is_metric != 0, bodies.mission_row, np.zeros_like(is_metric))
     imported = to_map.map_of_model(
         model,
         bodies,
@@ -63,7 +65,7 @@ def import_colmap(
         side,
         T_G_W=placing.T_G_W,
         scale=placing.scale,
-        is_metric=_metric_missions(bodies, side, placing, options),
+        is_metric=is_metric,
         sigma_px=options.colmap_keypoint_sigma_px,
         edge_sigma=np.repeat(
             [options.colmap_odometry_sigma_m, np.deg2rad(options.colmap_odometry_sigma_deg)], 3
@@ -79,6 +81,13 @@ def import_colmap(
         vi_map, attached = features.with_images(
             vi_map, names, Path(options.images), link=options.link_images, progress=progress
         )
+    if not is_metric.all():
+        notes.append(
+            "scale or gravity are arbitrary: optvi will refuse inertial terms; give --align_to=TRAJECTORY, "
+            "or --scale and --gravity"
+        )
+    if len(side.image_name):
+        notes.append("ids, times and body frames come from maplab.npz beside the model")
     return vi_map, ColmapImportReport(
         map_key=map_key,
         missions=tuple(to_hex_list(vi_map.missions.id)),
@@ -91,7 +100,7 @@ def import_colmap(
         scale=placing.scale,
         aligned_vertices=placing.matched,
         alignment_rmse_m=placing.rmse_m if placing.matched else None,
-        notes=(*notes, *_notes(vi_map, side)),
+        notes=tuple(notes),
     )
 
 
@@ -119,28 +128,6 @@ def _place(model: ColmapModel, bodies: to_map.BodyFrames, options: ColmapImportO
         direction = _direction(se3.inverse(model.images.T_C_W), options.gravity)
         T_G_W = se3.make(_turn_to_down(direction), np.zeros(3))
     return Placing(T_G_W, options.scale or 1.0, bool(options.scale and options.gravity))
-
-
-def _metric_missions(
-    bodies: to_map.BodyFrames, side: SideFile, placing: Placing, options: ColmapImportOptions
-) -> Mask:
-    """Return the missions (M,) whose scale and gravity are known."""
-    metric = np.full(len(bodies.mission_rig), placing.is_metric, dtype=np.bool_)
-    if not options.scale and not options.gravity:
-        metric |= picked(side.is_metric != 0, bodies.mission_row, np.zeros_like(metric))
-    return metric
-
-
-def _notes(vi_map: VIMap, side: SideFile) -> tuple[str, ...]:
-    notes = []
-    if not all(is_metric(vi_map, row) for row in range(len(vi_map.missions))):
-        notes.append(
-            "scale or gravity are arbitrary: optvi will refuse inertial terms; give --align_to=TRAJECTORY, "
-            "or --scale and --gravity"
-        )
-    if len(side.image_name):
-        notes.append("ids, times and body frames come from maplab.npz beside the model")
-    return tuple(notes)
 
 
 _NS_PER_S = 1_000_000_000

@@ -217,7 +217,8 @@ def map_camera(camera: ColmapCamera, sensor_id: str) -> Camera:
     values = camera.parameters
     distortion = model.distortion
     if model.number == _FULL_OPENCV:
-        distortion = _smallest_model(values[4:])
+        few = Distortion.RADTAN5 if values[8] else Distortion.RADTAN
+        distortion = Distortion.RATIONAL if values[9:].any() else few
         values = values[: 4 + DISTORTION_SIZE[distortion]]
     if distortion is None:
         raise UserError(
@@ -239,13 +240,6 @@ def map_camera(camera: ColmapCamera, sensor_id: str) -> Camera:
 def has_model(camera: ColmapCamera) -> bool:
     """Return whether maplab has the camera's model."""
     return MODELS[camera.model].distortion is not None
-
-
-def _smallest_model(coefficients: F64) -> Distortion:
-    """Return the model with the fewest coefficients (8) of OpenCV that are not zero."""
-    if coefficients[5:].any():
-        return Distortion.RATIONAL
-    return Distortion.RADTAN5 if coefficients[4] else Distortion.RADTAN
 
 
 # What a COLMAP model cannot hold of a map: ids, times, body frames and qualities, in a file beside it.

@@ -6,14 +6,11 @@ from maplab_py.interop.stamps import time_unit_option
 from maplab_py.options import Options, option
 from maplab_py.report import Report
 
-QUALITIES = ("good", "not_bad", "all")
-TIME_SOURCES = ("name", "file", "order")
-
 
 class ColmapExportOptions(Options):
     """Parts of a map to write."""
 
-    quality: str = option("not_bad", choices=QUALITIES)
+    quality: str = option("not_bad", choices=("good", "not_bad", "all"))
     """Landmarks to write, by their quality"""
     colmap_feature_type: str = ""
     """Write keypoints of this feature type only, and what they observe: Binary, SIFT, ... or a number; a
@@ -46,7 +43,7 @@ class ColmapExportReport(Report):
 class ColmapImportOptions(Options):
     """Conversion of a model to a map."""
 
-    timestamps_from: str = option("name", choices=TIME_SOURCES)
+    timestamps_from: str = option("name", choices=("name", "file", "order"))
     """Source of the images' times: their names, a file, or their order"""
     timestamps_file: str = ""
     """File of lines `image name, time stamp` for --timestamps_from=file"""

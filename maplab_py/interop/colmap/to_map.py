@@ -11,7 +11,6 @@ from maplab_py.geometry import alignment, se3
 from maplab_py.interop.colmap.model import (
     PIXEL_CENTRE,
     ColmapModel,
-    ColmapRig,
     SideFile,
     map_camera,
     picked,
@@ -185,7 +184,11 @@ def _sensors(
     odometry_ids = random_ids(len(bodies.mission_rig), rng)
     for mission, row in enumerate(bodies.mission_rig.tolist()):
         rig, name = model.rigs[row], to_hex(rig_id[row])
-        T_C_R = camera_poses(rig, scale)
+        T_C_R = rig.T_C_R * np.repeat([1.0, scale], [4, 3])
+        if not np.isfinite(T_C_R).all():
+            raise MapError(
+                f"rig {rig.id}: a camera has no pose on the rig: let COLMAP estimate it (rig_configurator)"
+            )
         cameras = tuple(
             map_camera(model.cameras[camera], to_hex(camera_id[camera])) for camera in rig.cameras
         )
@@ -200,21 +203,6 @@ def _sensors(
         sensor_id[mission, MissionSensor.NCAMERA] = from_hex(name)
         sensor_id[mission, MissionSensor.ODOMETRY_6DOF] = from_hex(odometry)
     return SensorSet(sensors, extrinsics), sensor_id
-
-
-def camera_poses(rig: ColmapRig, scale: float) -> F64:
-    """Return T_C_R (n, 7) of a rig's cameras, in metres.
-
-    Raises:
-        MapError: A camera has no pose.
-    """
-    T_C_R = rig.T_C_R.copy()
-    if not np.all(np.isfinite(T_C_R)):
-        raise MapError(
-            f"rig {rig.id}: a camera has no pose on the rig: let COLMAP estimate it (rig_configurator)"
-        )
-    T_C_R[:, 4:] *= scale
-    return T_C_R
 
 
 def _frames(

@@ -41,7 +41,8 @@ _IMU_LAYOUTS = tuple(
     (struct.Struct(f"{order}I").unpack_from, struct.Struct(f"{order}{_IMU_NUMBERS}d").unpack_from)
     for order in "><"
 )
-_SQLITE_HEADER = 100
+_SQLITE_HEADER = struct.Struct(">16xH6xII60xI4x")
+"""Size of pages, counter of changes, number of pages, and the change at which they were counted."""
 _METADATA = "metadata.yaml"
 _SHOWN = 40
 """Bytes of a text that are shown where it stands for a bag."""
@@ -324,21 +325,15 @@ def _check_databases(path: Path) -> None:
     files = sorted(path.glob("*.db3")) if path.is_dir() else [path]
     for file in files:
         with file.open("rb") as stream:
-            header = stream.read(_SQLITE_HEADER)
-        if len(header) < _SQLITE_HEADER or not header.startswith(bag_kinds.SQLITE):
+            header = stream.read(_SQLITE_HEADER.size)
+        if len(header) < _SQLITE_HEADER.size or not header.startswith(bag_kinds.SQLITE):
             continue  # no database: the library knows what it is
-        page_bytes, pages = struct.unpack_from(">H", header, 16)[0], _number(header, 28)
-        page_bytes = 65536 if page_bytes == 1 else page_bytes
-        is_counted = _number(header, 24) == _number(header, 92)
-        if is_counted and file.stat().st_size < page_bytes * pages:
+        page_bytes, changes, pages, counted_at = _SQLITE_HEADER.unpack(header)
+        wanted, size = (65536 if page_bytes == 1 else page_bytes) * pages, file.stat().st_size
+        if changes == counted_at and size < wanted:
             raise MapError(
-                f"{path}: the bag cannot be read ({file.name} has {file.stat().st_size:,} of "
-                f"{page_bytes * pages:,} bytes): {_REMEDY}"
+                f"{path}: the bag cannot be read ({file.name} has {size:,} of {wanted:,} bytes): {_REMEDY}"
             )
-
-
-def _number(data: bytes, offset: int) -> int:
-    return int(struct.unpack_from(">I", data, offset)[0])
 
 
 def _library_missing(name: str) -> UserError:
