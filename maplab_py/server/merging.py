@@ -108,8 +108,6 @@ class Merger:
         merging: MergingOptions,
         incremental: IncrementalOptions,
         *,
-        loops: LoopClosureOptions | None = None,
-        optimization: VIOptimizationOptions | None = None,
         map_folder: Path | None = None,
     ) -> None:
         """Start without a map.
@@ -117,8 +115,6 @@ class Merger:
         Args:
             merging: How submaps become one map.
             incremental: How much is looked at.
-            loops: How places are recognised.
-            optimization: Of a part, and of all.
             map_folder: Where the map is published, for its clouds; None = clouds are not looked at.
         """
         self.vi_map: VIMap | None = None  # the map; None before the first submap
@@ -127,8 +123,8 @@ class Merger:
         self.radius, self.note = 0.0, ""
         self._map_folder = map_folder
         self._merging, self._incremental = merging, incremental
-        self._loops = loops or LoopClosureOptions()
-        self._optimization = optimization or VIOptimizationOptions(
+        self._loops = LoopClosureOptions()
+        self._optimization = VIOptimizationOptions(
             hide_iterations_console_output=True, include_absolute_pose_constraints=True
         )
         self._places = PlaceIndex()

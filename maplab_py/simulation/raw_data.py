@@ -8,8 +8,8 @@ along the optical axis, 16 bit), `truth/mesh.ply` the surfaces.
 
 import dataclasses
 import os
-from collections.abc import Callable
 from contextlib import closing, nullcontext
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -245,7 +245,8 @@ def write_images(
         np.random.default_rng(seed),
     )
     for row, camera in enumerate(session.device.true_rig.cameras):
-        at_time, delay = _camera_motion(session, row), scenario.cameras[row].line_delay_s
+        T_I_C, delay = session.device.true_rig.T_B_C[row], scenario.cameras[row].line_delay_s
+        at_time = partial(session.recording.spline.poses_of, T_I_S=T_I_C)
         imager = imaging.Imager.of(
             painted, camera, scenario.images, delay, at_time, brightness, walkers
         )
@@ -269,17 +270,6 @@ def write_images(
                 for target, content in zip(targets, contents, strict=False):
                     with lasting_effect():
                         write_file(target / name, [content], durable=False)
-
-
-def _camera_motion(session: RecordedSession, row: int) -> Callable[[F64], F64]:
-    """Return the poses T_G_C (N, 7) of a camera as a function of the times (N,) [s]."""
-    T_I_C, spline = session.device.true_rig.T_B_C[row], session.recording.spline
-
-    def at_time(time_s: F64) -> F64:
-        inside = np.clip(time_s, 0.0, spline.duration_s)
-        return se3.compose(spline.evaluate(inside).T_G_I, T_I_C)
-
-    return at_time
 
 
 def _png(image: NDArray[np.generic]) -> bytes:

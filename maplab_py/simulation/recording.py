@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.errors import MapError, UserError
-from maplab_py.geometry import se3
 from maplab_py.interop.imu_csv import read_imu_csv
 from maplab_py.simulation import detection, scene, sensors, trajectory_motion
 from maplab_py.simulation.imu import ImuRecording, measure
@@ -165,16 +165,11 @@ def _detect_all(
     """Detect with every camera; images and tracks are numbered over all cameras."""
     cameras = device.true_rig.cameras
     time_s = clock.sample_s[clock.frame_row] + clock.lead_s
-    T_G_I = spline.evaluate(time_s).T_G_I
     parts, tracks = [], 0
     for row, camera in enumerate(cameras):
-        T_I_C = device.true_rig.T_B_C[row]
-
-        def at_time(time: F64, T_I_C: F64 = T_I_C) -> F64:
-            return se3.compose(spline.evaluate(time).T_G_I, T_I_C)
-
+        at_time = partial(spline.poses_of, T_I_S=device.true_rig.T_B_C[row])
         delay = scenario.cameras[row].line_delay_s
-        poses = detection.CameraPoses(time_s, se3.compose(T_G_I, T_I_C), delay, at_time)
+        poses = detection.CameraPoses(time_s, at_time(time_s), delay, at_time)
         detections = detection.detect(
             camera, poses, world, appearance.is_there, scenario.measurement, seeds.measurement
         )

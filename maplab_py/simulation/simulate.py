@@ -222,9 +222,8 @@ def with_lidar_clouds(
     first_s, last_s = recording.frame_s[0], recording.frame_s[-1]
     time_s = np.arange(first_s + 0.5 / options.rate_hz, last_s, 1.0 / options.rate_hz)
     time_ns = recording.time_ns[0] + np.round(1e9 * (time_s - first_s)).astype(np.int64)
-    T_G_L = se3.compose(recording.spline.evaluate(time_s).T_G_I, T_I_L)
     new = NewResources(seed=vi_map.missions.id[0].tobytes())
-    for pose in T_G_L:
+    for pose in recording.spline.poses_of(time_s, T_I_L):
         new.add(CLOUDS_WITH_INTENSITY, b"".join(encode_ply(lidar.scan(pose, rng))))
     mounted = with_sensor(vi_map, MissionSensor.LIDAR, words, imu_id, T_I_L)
     if not len(new):

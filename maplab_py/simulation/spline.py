@@ -63,6 +63,11 @@ class PoseSpline:
         q, w_I, alpha_I = self._rotation(segment, blend, rate, change)
         return MotionState(se3.make(q, p_G), v_G, a_G, w_I, alpha_I)
 
+    def poses_of(self, time_s: F64, T_I_S: F64) -> F64:
+        """Return the poses T_G_S (N, 7) of a sensor at times (N,) [s], before and after those at the ends."""
+        inside = np.clip(time_s, 0.0, self.duration_s)
+        return se3.compose(self.evaluate(inside).T_G_I, T_I_S)
+
     def _blending(self, u: F64) -> tuple[F64, F64, F64]:
         """Return the blending values (N, 3) at fractions u (N,), and their time derivatives."""
         ones, zeros = np.ones_like(u), np.zeros_like(u)

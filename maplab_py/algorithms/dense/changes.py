@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from maplab_py.algorithms.dense import field, fusion, meshing, options
+from maplab_py.algorithms.dense import field, fusion, meshing
 from maplab_py.algorithms.dense.grid import Mesh
 from maplab_py.array_types import F64, I64, Mask
 from maplab_py.geometry import se3
@@ -19,24 +19,19 @@ _MIN_AREA_M2 = 0.02
 """Area of a connected surface that is shown."""
 
 
-def changed_surfaces(
-    before: tuple[VIMap, Path],
-    after: tuple[VIMap, Path],
-    min_weight: float = options.MESH_MIN_WEIGHT,
-) -> tuple[Mesh, Mesh]:
+def changed_surfaces(before: tuple[VIMap, Path], after: tuple[VIMap, Path]) -> tuple[Mesh, Mesh]:
     """Return the surfaces that appeared, and those that vanished, in G.
 
     Args:
         before: Map with grids and distance fields, and its folder.
         after: Another one in the same frame G.
-        min_weight: Weight from which voxels count as observed.
 
     Raises:
         UserError: A map has no grid, or no distance field.
         MapError: A file is missing or damaged.
         EstimationError: A grid has no surface of this weight.
     """
-    meshes = [meshing.map_mesh(*state, None, min_weight, _NO_STEP)[0] for state in (before, after)]
+    meshes = [meshing.map_mesh(*state, most=_NO_STEP)[0] for state in (before, after)]
     appeared = _large_parts(meshes[1], _is_free(*before, meshes[1].p))
     return appeared, _large_parts(meshes[0], _is_free(*after, meshes[0].p))
 
