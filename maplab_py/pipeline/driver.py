@@ -167,7 +167,7 @@ class Driver:
         inner = ["-".join(folder.relative_to(parent.result).parts) for folder in maps]
         names = (
             inner
-            if len(self._stages[parent.stage].tasks) == 1
+            if len(self._stages[parent.stage.name].tasks) == 1
             else [f"{parent.name}-{name}" for name in inner]
         )
         return [self._task(stage, name, [folder]) for name, folder in zip(names, maps, strict=True)]
@@ -228,7 +228,7 @@ class Driver:
     def _submit(self, task: records.Task, *, is_alone: bool) -> None:
         options = self.settings.options
         hosts = 1 if is_alone else self._engine.slots_per_host()
-        limit_gb = task.memory_gb or options.task_memory_gb or self._engine.share_gb()
+        limit_gb = task.stage.memory_gb or options.task_memory_gb or self._engine.share_gb()
         limit_gb *= self._engine.slots_per_host() if is_alone else 1
         log = self._records.path(task, ".log")
         log.parent.mkdir(parents=True, exist_ok=True)
@@ -252,7 +252,7 @@ class Driver:
             keep_going=self.settings.keep_going,
             discard=self.settings.discard,
         )
-        state = self._stages[task.stage].state
+        state = self._stages[task.stage.name].state
         state.waiting, state.running = state.waiting - 1, state.running + 1
         self._running[task.title] = task
         self._engine.submit(order)
@@ -261,7 +261,7 @@ class Driver:
     def _take(self, outcome: messages.Outcome) -> None:
         """Note the end of a task, and decide whether it is tried again."""
         task = self._running.pop(outcome.title)
-        progress = self._stages[task.stage]
+        progress = self._stages[task.stage.name]
         state = progress.state
         state.running -= 1
         state.seconds += outcome.seconds

@@ -42,9 +42,9 @@ class Record:
 
 def record_of(task: Task, flags: dict[str, str], version: str) -> Record:
     """Return the record of a task that is not finished: what a finished one must agree with."""
-    return Record(
-        _FORMAT, task.stage, task.name, task.commands, flags, version, (), "", 0.0, 0.0, 0, ""
-    )
+    stage = task.stage
+    request = stage.name, task.name, stage.commands, flags, version
+    return Record(_FORMAT, *request, (), "", 0.0, 0.0, 0, "")
 
 
 class Records:
@@ -56,7 +56,7 @@ class Records:
 
     def path(self, task: Task, suffix: str) -> Path:
         """Return the path of one of a task's files: `.json`, `.jsonl` or `.log`."""
-        return self.folder / task.stage / f"{task.name}{suffix}"
+        return self.folder / task.stage.name / f"{task.name}{suffix}"
 
     def exist(self) -> bool:
         """Tell whether an earlier run has finished tasks."""
@@ -151,21 +151,21 @@ def _given(text: str | None) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """Commands on map folders."""
+    """Commands of a stage on map folders."""
 
-    stage: str  # name of its stage
+    stage: Stage
     name: str  # unique in the stage; the result's folder is called so
     inputs: tuple[Path, ...]  # map folders that it reads
-    commands: tuple[str, ...]  # commands of its stage
-    lines: tuple[str, ...]  # the same with the inputs put in; `<RESULT_FOLDER>` is not replaced yet
+    lines: tuple[
+        str, ...
+    ]  # the commands with the inputs put in; `<RESULT_FOLDER>` is not replaced yet
     result: Path  # folder that it writes
     edits_input: bool  # the result is the map itself, which the commands save
-    memory_gb: float  # most memory [GB]; 0 = no limit of its own
 
     @property
     def title(self) -> str:
         """Stage and name."""
-        return f"{self.stage}/{self.name}"
+        return f"{self.stage.name}/{self.name}"
 
     @property
     def script(self) -> str:
@@ -190,16 +190,7 @@ def task_on(
         repeated = inputs if MAP_TEMPLATE in line else inputs[:1]
         lines += [line.replace(MAP_TEMPLATE, shlex.quote(str(folder))) for folder in repeated]
     result = inputs[0] if edits_input else results / stage.name / name
-    return Task(
-        stage.name,
-        name,
-        tuple(inputs),
-        stage.commands,
-        tuple(lines),
-        result,
-        edits_input,
-        stage.memory_gb,
-    )
+    return Task(stage, name, tuple(inputs), tuple(lines), result, edits_input)
 
 
 def names_of(folders: Sequence[Path]) -> list[str]:
