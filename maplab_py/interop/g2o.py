@@ -126,7 +126,9 @@ def _has_factor(matrix: F64) -> bool:
 
 _POSE, _PLANAR_POSE = "VERTEX_SE3:QUAT", "VERTEX_SE2"
 _EDGE, _PLANAR_EDGE = "EDGE_SE3:QUAT", "EDGE_SE2"
-_WIDTH = {_POSE: 8, _EDGE: 30, _PLANAR_POSE: 4, _PLANAR_EDGE: 11}
+_FIX = "FIX"
+_LAYOUT = {_POSE: (1, 8), _EDGE: (2, 30), _PLANAR_POSE: (1, 4), _PLANAR_EDGE: (2, 11), _FIX: (1, 1)}
+"""Numbers of ids and of all words of each kind of line."""
 _LARGEST_ID = (1 << 64) - 1
 _MAX_BYTES = 500_000_000
 _GZIP, _GZIP_WINDOW = b"\x1f\x8b", 31
@@ -163,8 +165,9 @@ def read_g2o(path: Path) -> PoseGraph:
         MapError: The file cannot be read or a line is wrong; names file and line.
     """
     sections = _split(_text(path).splitlines(), path)
-    poses = [_numbers(sections, kind, path) for kind in (_POSE, _PLANAR_POSE)]
-    edges = [_numbers(sections, kind, path) for kind in (_EDGE, _PLANAR_EDGE)]
+    poses, edges = (
+        [sections[k] for k in kinds] for kinds in ((_POSE, _PLANAR_POSE), (_EDGE, _PLANAR_EDGE))
+    )
     ends = np.concatenate([edges[0][0], edges[1][0]])
     T_A_B = np.concatenate([_pose(edges[0][1][:, :7]), _planar_pose(edges[1][1][:, :3])])
     ids = np.concatenate([poses[0][0][:, 0], poses[1][0][:, 0]])
@@ -184,7 +187,6 @@ def read_g2o(path: Path) -> PoseGraph:
     missing = np.flatnonzero(ids[rows] != ends)
     if len(missing):
         raise MapError(f"{path}: an edge names pose {ends.ravel()[missing[0]]}, which is not there")
-    fixed = _ids(sections.get("FIX", []), None, path)
     information, num_repaired = positive_definite(
         np.concatenate(
             [_symmetric(edges[0][1][:, 7:], 6), _lifted(_symmetric(edges[1][1][:, 3:], 3))]
@@ -197,7 +199,7 @@ def read_g2o(path: Path) -> PoseGraph:
         second=rows[:, 1],
         T_A_B=T_A_B,
         information=information,
-        fixed=np.flatnonzero(np.isin(ids, fixed)),
+        fixed=np.flatnonzero(np.isin(ids, sections[_FIX][0])),
         num_repaired=num_repaired,
     )
 
@@ -232,7 +234,7 @@ def write_g2o(graph: PoseGraph, path: Path, *, overwrite: bool = False) -> None:
     def chunks() -> Iterator[str]:
         pose_line = f"{_POSE} %d" + " %.17g" * 7
         yield from format_rows(pose_line, [graph.id, graph.T_G_V[:, to_file]])
-        yield from (f"FIX {number}\n" for number in graph.id[graph.fixed].tolist())
+        yield from (f"{_FIX} {number}\n" for number in graph.id[graph.fixed].tolist())
         ends = [graph.id[graph.first], graph.id[graph.second]]
         edge_line = f"{_EDGE} %d %d" + " %.17g" * 28
         yield from format_rows(edge_line, [*ends, graph.T_A_B[:, to_file], upper])
@@ -240,38 +242,38 @@ def write_g2o(graph: PoseGraph, path: Path, *, overwrite: bool = False) -> None:
     write_text(path, chunks(), overwrite=overwrite)
 
 
-def _split(lines: list[str], path: Path) -> dict[str, list[tuple[int, list[str]]]]:
-    """Return line numbers and words by the first word."""
-    sections: dict[str, list[tuple[int, list[str]]]] = {}
+def _split(lines: list[str], path: Path) -> dict[str, tuple[U64, F64]]:
+    """Return ids (N, 1 or 2) and values of the lines of each kind; all numbers of FIX are ids."""
+    rows: dict[str, list[tuple[int, list[int], list[float]]]] = {kind: [] for kind in _LAYOUT}
     for number, line in enumerate(lines, 1):
-        words = line.split()
-        if not words or words[0].startswith(("#", "PARAMS_")):  # which no edge that is read names
+        kind, *words = line.split() or ["#"]
+        if kind.startswith(("#", "PARAMS_")):  # which no edge that is read names
             continue
-        kind = words[0]
-        if kind not in _WIDTH and kind != "FIX":
-            raise MapError(f"{path}:{number}: '{kind}' is not among {', '.join(_WIDTH)}, FIX")
-        wanted = _WIDTH.get(kind, len(words) - 1)
-        if len(words) - 1 != wanted:
-            raise MapError(f"{path}:{number}: {kind} has {len(words) - 1} numbers, not {wanted}")
-        sections.setdefault(kind, []).append((number, words))
-    return sections
+        if kind not in _LAYOUT:
+            raise MapError(f"{path}:{number}: '{kind}' is not among {', '.join(_LAYOUT)}")
+        ids, width = _LAYOUT[kind] if kind != _FIX else (len(words), len(words))
+        if len(words) != width:
+            raise MapError(f"{path}:{number}: {kind} has {len(words)} numbers, not {width}")
+        try:
+            rows[kind].append((number, [*map(int, words[:ids])], [*map(float, words[ids:])]))
+        except ValueError:
+            wrong = [word for word in words[:ids] if not word.isdecimal()]
+            problem = "is not an id: wants 64 bits without sign" if wrong else "is not a number"
+            wrong += [word for word in words[ids:] if not is_number(word)]
+            raise MapError(f"{path}:{number}: '{wrong[0]}' {problem}") from None
+    return {kind: _checked(kind, of_kind, path) for kind, of_kind in rows.items()}
 
 
-def _numbers(
-    sections: dict[str, list[tuple[int, list[str]]]], kind: str, path: Path
+def _checked(
+    kind: str, rows: list[tuple[int, list[int], list[float]]], path: Path
 ) -> tuple[U64, F64]:
-    """Return the ids (N, 1 or 2) and the values of the lines of one kind."""
-    ids = 2 if kind in (_EDGE, _PLANAR_EDGE) else 1
-    lines = sections.get(kind, [])
-    try:
-        rows = [[float(word) for word in words[1 + ids :]] for _, words in lines]
-    except ValueError:
-        for number, words in lines:
-            for word in words[1 + ids :]:
-                if not is_number(word):
-                    raise MapError(f"{path}:{number}: '{word}' is not a number") from None
-        raise
-    values = np.array(rows, dtype=np.float64).reshape(-1, _WIDTH[kind] - ids)
+    ids, width = _LAYOUT[kind]
+    for number, of_line, _ in rows:
+        if not all(0 <= value <= _LARGEST_ID for value in of_line):
+            wrong = next(value for value in of_line if not 0 <= value <= _LARGEST_ID)
+            raise MapError(f"{path}:{number}: '{wrong}' is not an id: wants 64 bits without sign")
+    numbers = [value for _, of_line, _ in rows for value in of_line]
+    values = np.array([row[2] for row in rows], dtype=np.float64).reshape(len(rows), width - ids)
     size = np.abs(values)
     problems = [
         (~np.isfinite(values).all(axis=1), "a value is not a finite number"),
@@ -280,25 +282,10 @@ def _numbers(
     if kind in (_POSE, _EDGE):
         is_zero = size[:, 3:7].max(axis=1, initial=0.0) < 1.0 / _LARGEST
         problems.append((is_zero, "the quaternion is zero"))
-    for wrong, problem in problems:
-        if wrong.any():
-            raise MapError(f"{path}:{lines[int(np.argmax(wrong))][0]}: {problem}")
-    return _ids(lines, ids, path).reshape(-1, ids), values
-
-
-def _ids(lines: list[tuple[int, list[str]]], count: int | None, path: Path) -> U64:
-    """Return the ids of lines, whole numbers of 64 bits without sign; `count` = None: all words are ids."""
-    end = None if count is None else 1 + count
-    try:
-        return np.array([int(word) for _, words in lines for word in words[1:end]], dtype=np.uint64)
-    except (ValueError, OverflowError):
-        for number, words in lines:
-            for word in words[1:end]:
-                if not word.isdecimal() or int(word) > _LARGEST_ID:
-                    raise MapError(
-                        f"{path}:{number}: '{word}' is not an id: wants 64 bits without sign"
-                    ) from None
-        raise
+    for wrong_rows, problem in problems:
+        if wrong_rows.any():
+            raise MapError(f"{path}:{rows[int(np.argmax(wrong_rows))][0]}: {problem}")
+    return np.array(numbers, dtype=np.uint64).reshape(-1, ids), values
 
 
 def _pose(values: F64) -> F64:

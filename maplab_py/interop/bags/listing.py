@@ -1,6 +1,9 @@
 """Content of a bag, whatever its messages are."""
 
+from __future__ import annotations
+
 import dataclasses
+from array import array
 from pathlib import Path
 
 from maplab_py.interop.bags.sensor_messages import COMPRESSED, IMAGE
@@ -45,21 +48,6 @@ class BagInfo(Report):
     images: tuple[BagImages, ...] = ()
 
 
-@dataclasses.dataclass
-class _Times:
-    type: str
-    count: int = 0
-    first_ns: int = 0
-    last_ns: int = 0
-    encoding: str = ""
-
-    def add(self, time_ns: int) -> None:
-        """Count a message."""
-        self.first_ns = min(self.first_ns, time_ns) if self.count else time_ns
-        self.last_ns = max(self.last_ns, time_ns) if self.count else time_ns
-        self.count += 1
-
-
 def bag_info(path: Path, *, progress: Progress = SILENT) -> BagInfo:
     """Read all messages of a bag and list its topics.
 
@@ -68,47 +56,44 @@ def bag_info(path: Path, *, progress: Progress = SILENT) -> BagInfo:
         MapError: It is damaged or has no index.
     """
     bag_files.check_bag(path, "--bag")
-    topics: dict[tuple[str, str], _Times] = {}
+    encodings: dict[str, str] = {}
     with bag_files.opened_bag(path) as reader:
-        for connection in reader.connections:
-            topics[connection.topic, connection.msgtype] = _Times(connection.msgtype)
+        arrivals = {(c.topic, c.msgtype): array("q") for c in reader.connections}
         total = reader.message_count
         messages = bag_files.all_messages(path, reader, list(reader.connections))
         for done, (connection, time_ns, data) in enumerate(messages):
             if done % _PROGRESS_EVERY == 0:
                 progress.step(done, total, "messages")
-            times = topics[connection.topic, connection.msgtype]
-            if not times.count and times.type in _IMAGES:
-                image = reader.deserialize(data, times.type)
-                times.encoding = image.encoding if times.type == IMAGE else image.format
-            times.add(time_ns)
-    heard = [times for times in topics.values() if times.count]
-    start_ns = min((times.first_ns for times in heard), default=None)
-    end_ns = max((times.last_ns for times in heard), default=0)
+            topic, kind = connection.topic, connection.msgtype
+            if topic not in encodings and kind in _IMAGES:
+                image = reader.deserialize(data, kind)
+                encodings[topic] = image.encoding if kind == IMAGE else image.format
+            arrivals[topic, kind].append(time_ns)
+    heard = [times for times in arrivals.values() if times]
+    start_ns = min(map(min, heard), default=None)
+    end_ns = max(map(max, heard), default=0)
     return BagInfo(
         bag=path,
         format=bag_writing.format_of_bag(path).value,
         start_ns=start_ns,
         duration_s=0.0 if start_ns is None else (end_ns - start_ns) * _NS_TO_S,
-        messages=sum(times.count for times in heard),
+        messages=sum(map(len, heard)),
         topics=tuple(
-            _topic(topic, times, start_ns or 0) for (topic, _), times in sorted(topics.items())
+            _topic(topic, kind, times, start_ns or 0)
+            for (topic, kind), times in sorted(arrivals.items())
         ),
-        images=tuple(
-            BagImages(topic, times.encoding)
-            for (topic, _), times in sorted(topics.items())
-            if times.encoding
-        ),
+        images=tuple(BagImages(*item) for item in sorted(encodings.items()) if item[1]),
     )
 
 
-def _topic(topic: str, times: _Times, start_ns: int) -> BagTopic:
-    duration_s = (times.last_ns - times.first_ns) * _NS_TO_S
+def _topic(topic: str, kind: str, times: array[int], start_ns: int) -> BagTopic:
+    first_ns, last_ns = (min(times), max(times)) if times else (0, 0)
+    duration_s = (last_ns - first_ns) * _NS_TO_S
     return BagTopic(
         topic=topic,
-        type=times.type,
-        messages=times.count,
-        start_s=(times.first_ns - start_ns) * _NS_TO_S if times.count else None,
+        type=kind,
+        messages=len(times),
+        start_s=(first_ns - start_ns) * _NS_TO_S if times else None,
         duration_s=duration_s,
-        rate_hz=(times.count - 1) / duration_s if duration_s > 0.0 else 0.0,
+        rate_hz=(len(times) - 1) / duration_s if duration_s > 0.0 else 0.0,
     )

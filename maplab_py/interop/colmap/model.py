@@ -251,6 +251,13 @@ FILE_NAME = "maplab.npz"
 _VERSION = 1
 
 
+def _column(leader: str, *width: int, kind: str = "i", rows_of: str = "") -> Any:
+    """Declare a column as long as another, of integers (i), numbers (f) or texts (U)."""
+    return dataclasses.field(
+        metadata={"leader": leader, "width": width, "kind": kind, "rows_of": rows_of}
+    )
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class SideFile:
     """Rows of the map by names of images and by ids of the model.
@@ -258,26 +265,26 @@ class SideFile:
     Points carry an observation, which tells whether a refined model still has the same point.
     """
 
-    mission_id: U64  # (M, 2)
-    mission_name: np.ndarray  # (M,) text
-    is_metric: I64  # (M,) 1 = scale and gravity are known
-    vertex_id: U64  # (F, 2)
-    vertex_mission: I64  # (F,) rows
-    vertex_time_ns: I64  # (F,)
-    image_name: np.ndarray  # (N,) text
-    image_vertex: I64  # (N,) rows
-    image_frame_id: U64  # (N, 2) ids of frames of the map
-    image_time_ns: I64  # (N,)
-    point: I64  # (L,) ids of points, ascending
-    point_image: I64  # (L,) rows of images that observe them
-    point_keypoint: I64  # (L,) keypoints of these images
-    landmark_id: U64  # (L, 2)
-    landmark_quality: I64  # (L,)
-    rig: I64  # (R,) ids of rigs
-    rig_id: U64  # (R, 2)
-    T_I_R: F64  # (R, 7)
-    camera: I64  # (C,) ids of cameras
-    camera_id: U64  # (C, 2)
+    mission_id: U64 = _column("mission_id", 2)
+    mission_name: NDArray[Any] = _column("mission_id", kind="U")
+    is_metric: I64 = _column("mission_id")  # 1 = scale and gravity are known
+    vertex_id: U64 = _column("vertex_id", 2)
+    vertex_mission: I64 = _column("vertex_id", rows_of="mission_id")
+    vertex_time_ns: I64 = _column("vertex_id")
+    image_name: NDArray[Any] = _column("image_name", kind="U")
+    image_vertex: I64 = _column("image_name", rows_of="vertex_id")
+    image_frame_id: U64 = _column("image_name", 2)  # of frames of the map
+    image_time_ns: I64 = _column("image_name")
+    point: I64 = _column("point")  # ids of points, ascending
+    point_image: I64 = _column("point", rows_of="image_name")  # images that observe them
+    point_keypoint: I64 = _column("point")  # keypoints of these images
+    landmark_id: U64 = _column("point", 2)
+    landmark_quality: I64 = _column("point")
+    rig: I64 = _column("rig")  # ids of rigs
+    rig_id: U64 = _column("rig", 2)
+    T_I_R: F64 = _column("rig", 7, kind="f")
+    camera: I64 = _column("camera")  # ids of cameras
+    camera_id: U64 = _column("camera", 2)
 
     def content(self) -> bytes:
         """Return the file's bytes, the same for the same content."""
@@ -295,8 +302,8 @@ class SideFile:
         """
         path = folder / FILE_NAME
         if not path.is_file():
-            columns = [(field.name, *_column(field.name)) for field in dataclasses.fields(cls)]
-            return cls(**{name: np.zeros((0, *width), kind[0]) for name, kind, width in columns})
+            columns = {field.name: field.metadata for field in dataclasses.fields(cls)}
+            return cls(**{n: np.zeros((0, *c["width"]), c["kind"]) for n, c in columns.items()})
         without = "delete it to import the model with new ids"
         try:
             arrays = read_npz(path)
@@ -310,40 +317,15 @@ class SideFile:
         return cls(**arrays)
 
 
-_COLUMNS = {
-    "mission_id": ("mission_id", "mission_name", "is_metric"),
-    "vertex_id": ("vertex_id", "vertex_mission", "vertex_time_ns"),
-    "image_name": ("image_name", "image_vertex", "image_frame_id", "image_time_ns"),
-    "point": ("point", "point_image", "point_keypoint", "landmark_id", "landmark_quality"),
-    "rig": ("rig", "rig_id", "T_I_R"),
-    "camera": ("camera", "camera_id"),
-}
-_REFERENCES = {
-    "vertex_mission": "mission_id",
-    "image_vertex": "vertex_id",
-    "point_image": "image_name",
-}
-
-
-def _column(name: str) -> tuple[tuple[str, ...], tuple[int, ...]]:
-    """Return the kinds and the width of a column."""
-    if name.endswith("_name"):
-        return ("U",), ()
-    if name == "T_I_R":
-        return ("f",), (7,)
-    return (("u8", "i8"), (2,)) if name.endswith("_id") else (("i8", "u8"), ())
-
-
 def _fits(arrays: dict[str, NDArray[Any]]) -> bool:
-    """Return whether the columns have equal lengths, the right widths, and rows that exist."""
-    for leader, columns in _COLUMNS.items():
-        for name in columns:
-            kinds, width = _column(name)
-            if arrays[name].shape != (len(arrays[leader]), *width) or all(
-                arrays[name].dtype.kind != kind[0] for kind in kinds
-            ):
-                return False
-    return all(
-        np.all((arrays[rows] >= 0) & (arrays[rows] < len(arrays[table])))
-        for rows, table in _REFERENCES.items()
-    )
+    """Return whether the columns have equal lengths, the right widths and kinds, and rows that exist."""
+    for field in dataclasses.fields(SideFile):
+        values, column = arrays[field.name], field.metadata
+        if values.shape != (len(arrays[column["leader"]]), *column["width"]):
+            return False
+        if values.dtype.kind not in ("iu" if column["kind"] == "i" else column["kind"]):
+            return False
+        owner = column["rows_of"]
+        if owner and not np.all((values >= 0) & (values < len(arrays[owner]))):
+            return False
+    return True

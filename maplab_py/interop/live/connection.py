@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import importlib
 import time
 from collections.abc import Iterator
 from functools import partial
@@ -12,6 +13,14 @@ from maplab_py.interop.live.transport import LOOK_EVERY_S, Topic, Transport
 from maplab_py.interop.recordings.bag_files import message_types
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import Report
+
+_CLASSES = {
+    "ros2": ("ros2", "Ros2"),
+    "ros1": ("ros1", "Ros1"),
+    "foxglove": ("foxglove", "FoxgloveClient"),
+    "foxglove_server": ("foxglove", "FoxgloveServer"),
+}
+"""File and class of each transport; their libraries may be missing."""
 
 
 @contextlib.contextmanager
@@ -29,23 +38,9 @@ def open_transport(
     """
     if kind not in TRANSPORTS:
         raise UserError(f"transport {kind}: wants one of {', '.join(TRANSPORTS)}")
-    transport: Transport
-    if kind == "ros2":
-        from maplab_py.interop.live.ros2 import Ros2
-
-        transport = Ros2(network)
-    elif kind == "ros1":
-        from maplab_py.interop.live.ros1 import Ros1
-
-        transport = Ros1(network)
-    elif is_server:
-        from maplab_py.interop.live.foxglove import FoxgloveServer
-
-        transport = FoxgloveServer(network)
-    else:
-        from maplab_py.interop.live.foxglove import FoxgloveClient
-
-        transport = FoxgloveClient(network)
+    file, name = _CLASSES[kind + "_server" * (is_server and kind == "foxglove")]
+    module = importlib.import_module(f"maplab_py.interop.live.{file}")
+    transport: Transport = getattr(module, name)(network)
     try:
         yield transport
     finally:

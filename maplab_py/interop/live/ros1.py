@@ -65,24 +65,22 @@ def receive_header(connection: socket.socket) -> dict[str, str]:
         ConnectionProblem: It is damaged or too large, or the connection ends.
         OSError: The connection fails.
     """
-    return parse_header(bytes(_receive_block(connection, _MAX_HEADER_BYTES, "connection header")))
+    return parse_header(receive_block(connection, "connection header", _MAX_HEADER_BYTES))
 
 
-def receive_message(connection: socket.socket) -> bytes:
-    """Receive a message.
+def receive_block(
+    connection: socket.socket, kind: str = "message", limit: int = transports.MAX_MESSAGE_BYTES
+) -> bytes:
+    """Receive a message, or what else has its length before it.
 
     Raises:
         ConnectionProblem: It is too large, or the connection ends.
         OSError: The connection fails.
     """
-    return bytes(_receive_block(connection, transports.MAX_MESSAGE_BYTES, "message"))
-
-
-def _receive_block(connection: socket.socket, limit: int, what: str) -> bytearray:
     size = struct.unpack("<I", _receive(connection, 4))[0]
     if size > limit:
-        raise ConnectionProblem(f"a {what} of {size:,} bytes is refused (at most {limit:,})")
-    return _receive(connection, size)
+        raise ConnectionProblem(f"a {kind} of {size:,} bytes is refused (at most {limit:,})")
+    return bytes(_receive(connection, size))
 
 
 def _receive(connection: socket.socket, size: int) -> bytearray:
@@ -268,7 +266,7 @@ class Ros1:
                 with self._lock:
                     self._connections[topic, uri] = connection
                 while True:
-                    take(receive_message(connection))
+                    take(receive_block(connection))
         except (*_XMLRPC_ERRORS, ConnectionProblem) as error:
             if not self._is_closed.is_set():
                 reason = " ".join(str(error).split())

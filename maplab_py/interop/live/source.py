@@ -95,7 +95,12 @@ class LiveRecording:
         topics = transports.wait_for_topics(transport, [*self._imu_names, *cameras], wait_s)
         for row, topic in enumerate(topics):
             is_imu = row < len(self._imu_names)
-            _check_type(transport, topic, (bags.IMU_TYPE,) if is_imu else bags.IMAGE_TYPES)
+            wanted = (bags.IMU_TYPE,) if is_imu else bags.IMAGE_TYPES
+            if topic.type not in wanted:
+                raise UserError(
+                    f"{transport.name}: {topic.name} has messages of type {topic.type}, needed is "
+                    f"{' or '.join(wanted)}: choose another topic; live_topics lists what there is"
+                )
         self._camera_types = [topic.type for topic in topics[len(self._imu_names) :]]
         self._offsets_ns = [camera.time_offset_ns for camera in device.cameras]
         self.inbox = Inbox(len(cameras), tolerance_ns, options.max_delay_s)
@@ -176,8 +181,9 @@ class LiveRecording:
                 if 0.0 < self._options.silence_s < silent_s:
                     break
                 if silent_s > _TELL_AFTER_S and not has_told:
-                    has_told = True
-                    self._tell(f"nothing arrives from {self.name}: waiting{self._until()}")
+                    has_told, silence_s = True, self._options.silence_s
+                    until = f" up to {silence_s:g} s" if silence_s else "; Ctrl-C ends"
+                    self._tell(f"nothing arrives from {self.name}: waiting{until}")
                 continue
             heard_s, has_told = time.monotonic(), False
             batch = self._batch(arrivals.imu)
@@ -208,10 +214,6 @@ class LiveRecording:
         token = current_token()
         token.check()
         return token.is_ending
-
-    def _until(self) -> str:
-        silence_s = self._options.silence_s
-        return f" up to {silence_s:g} s" if silence_s else "; Ctrl-C ends"
 
     def _tell_problems(self) -> None:
         """Say what has gone wrong in the connection since the last time."""
@@ -398,16 +400,6 @@ def _camera_topics(device: protocol.RecordedSensors, source: SourceOptions) -> l
     if len(set(names)) < len(names):
         raise UserError("two cameras have the same topic: give different --camera_topics")
     return [transports.topic_of(name) for name in names]
-
-
-def _check_type(
-    transport: transports.Transport, topic: transports.Topic, wanted: Sequence[str]
-) -> None:
-    if topic.type not in wanted:
-        raise UserError(
-            f"{transport.name}: {topic.name} has messages of type {topic.type}, needed is "
-            f"{' or '.join(wanted)}: choose another topic; live_topics lists what there is"
-        )
 
 
 # Messages as they arrive: decoded with the functions that bags use, damage told as such.

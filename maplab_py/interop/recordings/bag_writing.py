@@ -243,21 +243,9 @@ def _connection(writer: Any, channel: Channel, store: Any, kind: BagFormat, path
             f"{path}: messages of {channel.topic} have the type {channel.type}, which has no "
             "definition: record them with ROS 2 Iron or later, which stores it"
         )
+    digest, described = channel.digest or None, {"typestore": store, "msgdef": definition}
     if kind is BagFormat.ROS1:
-        return writer.add_connection(
-            channel.topic,
-            channel.type,
-            typestore=store,
-            msgdef=definition,
-            md5sum=channel.digest or None,
-            callerid=channel.caller,
-            latching=channel.latching,
-        )
-    return writer.add_connection(
-        channel.topic,
-        channel.type,
-        typestore=store,
-        msgdef=definition,
-        rihs01=channel.digest or None,
-        offered_qos_profiles=channel.qos,
-    )
+        described |= {"md5sum": digest, "callerid": channel.caller, "latching": channel.latching}
+    else:
+        described |= {"rihs01": digest, "offered_qos_profiles": channel.qos}
+    return writer.add_connection(channel.topic, channel.type, **described)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from maplab_py.array_types import I64, NDArray
+from maplab_py.array_types import I64
 from maplab_py.errors import MapError, UserError, os_errors_as
 from maplab_py.input_files import DEFAULT_MAX_BYTES, read_bytes
 from maplab_py.interop.ply import (
@@ -61,9 +61,16 @@ def parse_pcd(data: bytes, source: str) -> PlyCloud:
         if form == "binary":
             table = np.frombuffer(data, dtype=dtype, count=count, offset=begin)
         else:
-            with np.errstate(invalid="raise", over="raise"):  # numbers that do not fit their type
-                table = _from_text(data[begin:], dtype, count)
-    except (ValueError, FloatingPointError) as error:
+            text = data[begin:].decode("ascii", errors="replace")
+            lines = [line for line in text.splitlines() if line.strip()][:count]
+            if len(lines) < count:
+                raise ValueError(f"{len(lines)} of {count} lines")
+            table = (
+                np.loadtxt(lines, dtype=dtype, ndmin=1, comments=None)
+                if lines
+                else np.zeros(0, dtype)
+            )
+    except ValueError as error:
         raise MapError(f"{source}: the PCD data end early or do not fit ({error})") from None
     cloud = cloud_of_table(table)
     return cloud.where(np.isfinite(cloud.p).all(axis=1))
@@ -99,22 +106,6 @@ def _point_type(header: dict[str, list[str]], source: str) -> np.dtype[np.void]:
     if not {"x", "y", "z"} <= set(dtype.names or ()):
         raise MapError(f"{source}: the PCD file has no points with x, y, z")
     return dtype
-
-
-def _from_text(body: bytes, dtype: np.dtype[np.void], count: int) -> NDArray[np.void]:
-    widths = [int(np.prod(dtype[name].shape)) for name in dtype.names or ()]
-    words = body.split()
-    if len(words) < count * sum(widths):
-        raise ValueError(f"{len(words)} of {count * sum(widths)} numbers")
-    values = np.array(words[: count * sum(widths)], dtype=np.float64)
-    columns = values.reshape(count, sum(widths))
-    table = np.zeros(count, dtype=dtype)
-    first = 0
-    for name, width in zip(dtype.names or (), widths, strict=True):
-        column = columns[:, first : first + width]
-        table[name] = column[:, 0] if dtype[name].shape == () else column.reshape(count, -1)
-        first += width
-    return table
 
 
 XYZ, XYZRGB, XYZI = 16, 17, 21

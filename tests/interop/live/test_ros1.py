@@ -35,7 +35,7 @@ def test_damaged_headers_are_refused(data: bytes) -> None:
 
 
 @pytest.mark.parametrize(
-    ("receive", "what"), [(ros1.receive_header, "header"), (ros1.receive_message, "message")]
+    ("receive", "what"), [(ros1.receive_header, "header"), (ros1.receive_block, "message")]
 )
 def test_sizes_are_checked_before_memory_is_taken(receive: object, what: str) -> None:
     here, there = socket.socketpair()
