@@ -176,15 +176,7 @@ class Task:
 def task_on(
     stage: Stage, name: str, inputs: Sequence[Path], results: Path, *, edits_input: bool
 ) -> Task:
-    """Return the task of a stage on some maps; see `Stage.commands`.
-
-    Args:
-        stage: What to run.
-        name: Name of the task.
-        inputs: Map folders.
-        results: Folder of all results.
-        edits_input: The commands save the only map where it is.
-    """
+    """Return the task of a stage on some maps; see `Task` and `Stage.commands`."""
     lines: list[str] = []
     for line in stage.commands:
         repeated = inputs if MAP_TEMPLATE in line else inputs[:1]

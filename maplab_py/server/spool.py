@@ -69,12 +69,7 @@ class Spool:
     """The folders of a spool."""
 
     def __init__(self, root: Path, *, quiet_s: float = QUIET_S) -> None:
-        """Use a folder, which need not exist.
-
-        Args:
-            root: The folder.
-            quiet_s: See `QUIET_S`.
-        """
+        """Use a folder, which need not exist."""
         self.root, self._quiet_s = root.absolute(), quiet_s
         self.incoming = self.root / "incoming"
         self.partial = self.incoming / ".partial"
