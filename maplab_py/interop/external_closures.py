@@ -14,7 +14,7 @@ import numpy as np
 from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.errors import MapError
 from maplab_py.geometry import interpolation, se3, so3
-from maplab_py.input_files import LARGEST, read_text
+from maplab_py.input_files import DEFAULT_MAX_BYTES, LARGEST, read_foreign_text
 from maplab_py.report import counted
 from maplab_py.sensors.yaml_text import parse_yaml
 from maplab_py.vimap import LoopClosureEdges, VIMap, edits, random_ids
@@ -76,12 +76,7 @@ def read_external_closures(vi_map: VIMap, path: Path) -> tuple[LoopClosureEdges,
 
 
 def _entries(path: Path) -> list[Any]:
-    try:
-        content = parse_yaml(read_text(path, error=MapError), str(path))
-    except OSError as error:
-        raise MapError(f"cannot read {path}: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise MapError(f"{path} is not YAML: it is not UTF-8 text") from error
+    content = parse_yaml(read_foreign_text(path, DEFAULT_MAX_BYTES), str(path))
     if not isinstance(content, list):
         raise MapError(f"{path}: a list of loop closures is expected")
     return content

@@ -231,12 +231,6 @@ def format_rows(row_format: str, columns: Sequence[NDArray[Any] | list[Any]]) ->
         yield (line * len(lists[0])) % tuple(values)
 
 
-def seconds_text(times_ns: I64) -> tuple[I64, I64]:
-    """Return whole seconds and nanoseconds, for the format `%d.%09d` of times that are >= 0."""
-    seconds, rest = np.divmod(times_ns, 1_000_000_000)
-    return seconds, rest
-
-
 def _data_lines(text: str) -> tuple[list[str], list[int], list[str], bool]:
     """Return the rows, their line numbers, the comments and headers, and whether stamps were dates."""
     lines: list[str] = []

@@ -228,7 +228,7 @@ def write_tum(trajectory: Trajectory, path: Path, *, overwrite: bool = False) ->
         UserError: The file exists and `overwrite` is not set, or it cannot be written.
     """
     T = trajectory.T_R_B
-    columns = [*text_table.seconds_text(trajectory.times_ns), T[:, 4:], T[:, :4]]
+    columns = [*np.divmod(trajectory.times_ns, 1_000_000_000), T[:, 4:], T[:, :4]]
     write_text(path, text_table.format_rows("%d.%09d" + " %.17g" * 7, columns), overwrite=overwrite)
 
 

@@ -1,7 +1,6 @@
 """Poses of a map as messages, and a bag copied with them (maplab's pose_to_bag)."""
 
 import dataclasses
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -70,13 +69,13 @@ def add_poses_to_bag(
         _check_types(source, present, poses, options, kind)
         added = [_added(entry, options, kind, present) for entry in poses]
         total = reader.message_count + sum(len(entry.times_ns) for entry in poses)
-        copied = Counter[str]()
+        copied = sum(c.msgcount for c in reader.connections if c.topic not in dropped)
         counts = bag_writing.write_bag(
             target,
             kind,
             bag_writing.watched(
                 bag_writing.in_order(
-                    _counted(bag_writing.messages_of_bag(source, reader, without=dropped), copied),
+                    bag_writing.messages_of_bag(source, reader, without=dropped),
                     *(stream for streams in added for stream in streams),
                 ),
                 total,
@@ -91,7 +90,7 @@ def add_poses_to_bag(
         format=kind.value,
         missions=tuple(labels[row] for row in rows),
         topics=written_topics(counts),
-        copied_messages=copied.total(),
+        copied_messages=copied,
         messages=sum(counts.values()),
     )
 
@@ -183,11 +182,3 @@ def _check_types(
                 f"{source}: {topic} has messages of type {type_}, not {sorted(added[topic])[0]}: "
                 f"give {remedy}another bag"
             )
-
-
-def _counted(
-    messages: Iterator[bag_writing.BagMessage], counts: Counter[str]
-) -> Iterator[bag_writing.BagMessage]:
-    for message in messages:
-        counts[message.channel.topic] += 1
-        yield message

@@ -42,26 +42,20 @@ def read_model(folder: Path) -> colmap.ColmapModel:
 
 def _models_below(folder: Path) -> str:
     """Return a clause on the models in folders below, with what they have; empty without any."""
-    below = [path for path in (*folder.glob("*"), *folder.glob("sparse/*")) if path.is_dir()]
     models: list[tuple[int, str]] = []
-    for path in sorted(below):
-        suffixes = [
-            s for s in (".bin", ".txt") if any((path / f"{kind}{s}").is_file() for kind in _NEEDED)
-        ]
-        if not suffixes:
-            continue
-        name, suffix = path.relative_to(folder).as_posix(), suffixes[0]
-        missing = [
-            f"{kind}{suffix}" for kind in _NEEDED if not (path / f"{kind}{suffix}").is_file()
-        ]
-        counts = [_count(path / f"{kind}{suffix}") for kind in ("images", "points3D")]
-        said = (
-            f"incomplete: no {', '.join(missing)}"
-            if missing
-            else f"{counts[0]} images, {counts[1]} points"
-        )
-        images = 0 if missing or counts[0] == "?" else int(counts[0])
-        models.append((images, f"{name} ({said})"))
+    for path in sorted([*folder.glob("*/"), *folder.glob("sparse/*/")]):
+        by_suffix = [[path / f"{kind}{suffix}" for kind in _NEEDED] for suffix in (".bin", ".txt")]
+        files = next((files for files in by_suffix if any(f.is_file() for f in files)), [])
+        missing = [file.name for file in files if not file.is_file()]
+        if files:
+            images, points = (_count(file) for file in files[1:])
+            said = (
+                f"incomplete: no {', '.join(missing)}"
+                if missing
+                else f"{images} images, {points} points"
+            )
+            number = int(images) if images.isdecimal() and not missing else 0
+            models.append((number, f"{path.relative_to(folder).as_posix()} ({said})"))
     if not models:
         return ""
     models.sort(key=lambda model: -model[0])

@@ -8,7 +8,7 @@ import numpy as np
 from maplab_py.array_types import I64, Mask
 from maplab_py.errors import UserError
 from maplab_py.interop.colmap import pycolmap_files
-from maplab_py.interop.colmap.model import MODELS, NO_POINT, ColmapCamera, ColmapModel, has_model
+from maplab_py.interop.colmap.model import MODELS, NO_POINT, ColmapModel, has_model
 from maplab_py.sensors import Camera, CameraRig, SensorSet, projection
 from maplab_py.sensors.camera import Distortion, Projection
 from maplab_py.vimap import MissionSensor, VIMap, mission_sensor_id, ragged_rows
@@ -25,36 +25,26 @@ def perspective_model(model: ColmapModel, folder: Path) -> ColmapModel:
         UserError: A camera is equirectangular.
         MapError: pycolmap fails.
     """
-    images = model.images
-    cameras = [camera for camera in model.cameras if not has_model(camera)]
-    for camera in cameras:
-        if MODELS[camera.model].name == "EQUIRECTANGULAR":
-            raise UserError(
-                f"{folder}: camera {camera.id} is EQUIRECTANGULAR: no perspective image shows it"
-            )
-    new = {camera.id: _pinhole(camera) for camera in cameras}
+    images, cameras = model.images, list(model.cameras)
     uv, point = images.uv.copy(), images.point.copy()
     for row, camera in enumerate(model.cameras):
         if has_model(camera):
             continue
+        if MODELS[camera.model].name == "EQUIRECTANGULAR":
+            raise UserError(
+                f"{folder}: camera {camera.id} is EQUIRECTANGULAR: no perspective image shows it"
+            )
+        # of SIMPLE_DIVISION the parameters are f cx cy k
+        values = camera.parameters[[0, 0, 1, 2] if len(camera.parameters) == 4 else [0, 1, 2, 3]]
+        cameras[row] = dataclasses.replace(camera, model=_PINHOLE, parameters=values)
         mine = ragged_rows(images.keypoint_start, np.flatnonzero(images.camera == row))
         rays = pycolmap_files.rays_of(camera, uv[mine])
         seen: Mask = np.asarray(np.isfinite(rays).all(axis=1))
         seen &= np.linalg.norm(np.where(seen[:, None], rays, 0.0), axis=1) < _LARGEST_TANGENT
-        values = new[camera.id].parameters
         uv[mine] = np.where(seen[:, None], rays * values[:2] + values[2:], -1.0)
         point[mine[~seen]] = NO_POINT
-    return dataclasses.replace(
-        model,
-        cameras=tuple(new.get(camera.id, camera) for camera in model.cameras),
-        images=dataclasses.replace(images, uv=uv, point=point),
-    )
-
-
-def _pinhole(camera: ColmapCamera) -> ColmapCamera:
-    has_single_focal_length = len(camera.parameters) == 4  # SIMPLE_DIVISION: f cx cy k
-    values = camera.parameters[[0, 0, 1, 2]] if has_single_focal_length else camera.parameters[:4]
-    return dataclasses.replace(camera, model=_PINHOLE, parameters=values)
+    images = dataclasses.replace(images, uv=uv, point=point)
+    return dataclasses.replace(model, cameras=tuple(cameras), images=images)
 
 
 _MIN_Z = 0.1
