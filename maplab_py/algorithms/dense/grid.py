@@ -23,6 +23,8 @@ _STEPS_PER_BLOCK = 4
 """Blocks are taken at pixels that are a quarter of a block apart at the largest depth ..."""
 _MAX_PIXEL_STEP = 8
 """... but no further than this."""
+_MOST_BLOCKS = 1_000_000
+"""Blocks of a depth map, 4 GB of voxels, that are looked for at first."""
 _BLOCKS_AT_A_TIME = 2048
 """Blocks whose voxels are meshed at a time."""
 _CORNERS = np.array([[m & 1, m >> 1 & 1, m >> 2] for m in range(8)])
@@ -85,10 +87,15 @@ def blocks_of_views(
         step = int(pinhole.focal_px * block_m / (_STEPS_PER_BLOCK * settings.max_depth_m))
         step = min(max(step, 1), _MAX_PIXEL_STEP)
         range_m = settings.min_depth_m, settings.max_depth_m
-        numbers = block_m, settings.truncation_m, *range_m, step, float(with_free_space)
-        touched = grid_kernels.keys_of_depth(depth, camera, T_G_C, np.array(numbers))
-        keys = np.union1d(keys, touched)
-        require_memory(len(keys) * _BYTES_PER_BLOCK, "the grid of distances")
+        numbers = [block_m, settings.truncation_m, *range_m, step, with_free_space, _MOST_BLOCKS]
+        while True:  # more blocks are looked for only if those so far have room
+            touched = grid_kernels.keys_of_depth(depth, camera, T_G_C, np.array(numbers, float))
+            together = np.union1d(keys, touched)
+            require_memory(len(together) * _BYTES_PER_BLOCK, "the grid of distances")
+            if len(touched) < numbers[-1]:
+                break
+            numbers[-1] *= 4
+        keys = together
     parts = (keys >> KEY_BITS * place & (2 * LIMIT - 1) for place in (2, 1, 0))
     return np.stack([part - LIMIT for part in parts], axis=1).astype(np.int32)
 

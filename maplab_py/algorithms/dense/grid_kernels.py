@@ -25,8 +25,8 @@ def keys_of_depth(depth: F32, camera: F64, T_G_C: F64, settings: F64) -> I64:
         camera: Focal length, centre u, centre v [px].
         T_G_C: Pose (4, 4) of the camera.
         settings: Side of a block, truncation distance, smallest and largest depth [m], the step
-            between the pixels that are looked at, and 1 to add the blocks of the free space in front of
-            the surface, too, else 0.
+            between the pixels that are looked at, 1 to add the blocks of the free space in front of
+            the surface, too, else 0, and the number of blocks after which no more rows are looked at.
 
     Returns:
         Packed coordinates (B,), each once.
@@ -36,6 +36,8 @@ def keys_of_depth(depth: F32, camera: F64, T_G_C: F64, settings: F64) -> I64:
     last = np.int64(-1)
     keys = {last}
     for v in range(0, depth.shape[0], step):
+        if len(keys) > settings[6]:
+            break
         y = (v - camera[2]) / camera[0]
         for u in range(0, depth.shape[1], step):
             z = np.float64(depth[v, u])
@@ -191,7 +193,7 @@ def integrate_depth(
 def compile_kernels() -> None:
     """Compile the kernels of this module for the types that the grid uses."""
     depth = np.ones((2, 2), dtype=np.float32)
-    keys_of_depth(depth, np.ones(3), np.eye(4), np.array([1.0, 0.1, 0.1, 9.0, 1.0, 0.0]))
+    keys_of_depth(depth, np.ones(3), np.eye(4), np.array([1.0, 0.1, 0.1, 9.0, 1.0, 0.0, 9.0]))
     voxels = np.zeros((1, BLOCK_SIDE, BLOCK_SIDE, BLOCK_SIDE), dtype=np.float32)
     image = np.array([1.0, 0.5, 0.5, 2.0, 2.0, 0.1, 9.0])
     settings = np.array([0.1, 0.3, 2.0, 1e4, 1.0])

@@ -371,6 +371,17 @@ def test_memory_is_bounded() -> None:
         blocks_of_views([(depth_of_sphere(T_G_C), PINHOLE, T_G_C)], settings)
 
 
+def test_blocks_are_the_same_however_many_are_looked_for_at_first(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    T_G_C = looking_at_origin(np.array([1.0, 0.0, 0.0]), 2.0)
+    view = depth_of_sphere(T_G_C), PINHOLE, T_G_C
+    expected = blocks_of_views([view], SETTINGS, with_free_space=True)
+    monkeypatch.setattr("maplab_py.algorithms.dense.grid._MOST_BLOCKS", 3)
+    blocks = blocks_of_views([view], SETTINGS, with_free_space=True)
+    np.testing.assert_array_equal(blocks, expected)
+
+
 def test_places_beyond_the_grid_are_refused() -> None:
     T_G_C = np.eye(4)
     T_G_C[0, 3] = 1e6
