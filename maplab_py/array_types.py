@@ -18,6 +18,14 @@ I8 = NDArray[np.int8]
 Mask = NDArray[np.bool_]
 
 __all__ = ["F32", "F64", "I8", "I32", "I64", "U8", "U32", "U64", "Mask", "NDArray", "Rows"]
+__all__ += ["mask_of"]
+
+
+def mask_of(count: int, rows: Any) -> Mask:
+    """Return which of `count` rows are among some rows (indices, or a mask)."""
+    mask = np.zeros(count, dtype=np.bool_)
+    mask[rows] = True
+    return mask
 
 
 @dataclass_transform(frozen_default=True, eq_default=False)

@@ -347,7 +347,7 @@ class DeviceCalibration:
         before = database.with_only({record.key for record in database.records} - recent)
         tests = test_segments(before, sensors, OPTIONS, PROBABILITY, SILENT)
         pairs = zip(before.records, tests, strict=True)
-        agreeing = {record.key for record, test in pairs if not test.is_outdated}
+        agreeing = {record.key for record, test in pairs if not test.outdated}
         return database.with_only(recent | agreeing)
 
     def _drop(self, database: SegmentDatabase, valid: SegmentDatabase) -> None:

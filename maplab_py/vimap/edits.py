@@ -5,7 +5,7 @@ import hashlib
 import numpy as np
 from numpy.typing import ArrayLike
 
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64, Mask, mask_of
 from maplab_py.geometry import se3, so3
 from maplab_py.vimap.ids import IdArray, is_valid, random_ids
 from maplab_py.vimap.selection import as_mask, as_rows, keep_rows
@@ -121,8 +121,7 @@ def merge_landmarks(vi_map: VIMap, from_rows: ArrayLike, into_rows: ArrayLike) -
         return vi_map
     before = vi_map.keypoints.landmark
     after = np.append(survivor, NO_ROW).astype(np.int32)[before]
-    united = np.zeros(count, dtype=np.bool_)
-    united[survivor[absorbed]] = True
+    united = mask_of(count, survivor[absorbed])
     rows = np.flatnonzero((after >= 0) & united[after])
     frame = vi_map.keypoint_frame[rows]
     order = np.lexsort((rows, before[rows] != after[rows], frame, after[rows]))
@@ -137,8 +136,7 @@ def merge_landmarks(vi_map: VIMap, from_rows: ArrayLike, into_rows: ArrayLike) -
 def survivors(source: I64, target: I64, count: int) -> I64:
     """Return the row (count,) that each landmark ends up in when `merge_landmarks` merges pairs (N,)."""
     label = connected_groups(source, target, count)
-    is_source = np.zeros(count, dtype=np.bool_)
-    is_source[source[source != target]] = True
+    is_source = mask_of(count, source[source != target])
     # the first of each group when sorted by (is a source, row)
     order = np.lexsort((np.arange(count), is_source, label))
     first = np.zeros(count, dtype=np.int64)

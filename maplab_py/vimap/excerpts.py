@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from maplab_py.array_types import I32, I64, Mask
+from maplab_py.array_types import I32, I64, Mask, mask_of
 from maplab_py.distinct import distinct
 from maplab_py.vimap import edits, ids, selection, table, tables, vertex_removal
 from maplab_py.vimap.vi_map import VIMap
@@ -88,8 +88,7 @@ class Excerpt:
         after = np.append(kept, tables.NO_ROW)[after]
         if len(kept) == len(self.landmarks) and np.array_equal(before, after):
             return whole
-        is_kept = np.zeros(len(self.landmarks) + 1, dtype=np.bool_)
-        is_kept[kept] = True
+        is_kept = mask_of(len(self.landmarks) + 1, kept)
         moved = np.flatnonzero((before >= 0) & ~is_kept[before] & (after >= 0))
         source, target = _most_frequent(before[moved], after[moved])
         merged = edits.merge_landmarks(whole, self.landmarks[source], self.landmarks[target])

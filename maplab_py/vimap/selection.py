@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from maplab_py.array_types import I32, I64
+from maplab_py.array_types import I32, I64, mask_of
 from maplab_py.vimap.table import ragged_rows, starts_of_counts
 from maplab_py.vimap.tables import NO_ROW, ResourceOwner
 from maplab_py.vimap.vi_map import VIMap
@@ -26,9 +26,7 @@ def as_rows(rows_or_mask: ArrayLike, size: int) -> I64:
 
 def as_mask(rows_or_mask: ArrayLike, size: int) -> NDArray[np.bool_]:
     """Return the boolean mask (size,) of rows or a mask."""
-    mask = np.zeros(size, dtype=np.bool_)
-    mask[as_rows(rows_or_mask, size)] = True
-    return mask
+    return mask_of(size, as_rows(rows_or_mask, size))
 
 
 def renumbering(size: int, kept: NDArray[Any]) -> I32:

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64, Mask, mask_of
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.vimap import ids, selection, tables
@@ -87,8 +87,7 @@ def _chains(
     is_link = (end == origin + 1) & (mission[end] == mission[origin])
     link = np.full(count, -1, dtype=np.int64)  # edge from vertex i to vertex i + 1
     link[origin[is_link][::-1]] = rows[is_link][::-1]
-    chosen = np.zeros(len(table), dtype=np.bool_)
-    chosen[link[link >= 0]] = True
+    chosen = mask_of(len(table), link[link >= 0])
     passed = np.zeros(len(table), dtype=np.bool_)
     passed[rows] = vertex_kept[origin] & vertex_kept[end]
     passed &= ~chosen

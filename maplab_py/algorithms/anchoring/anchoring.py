@@ -41,7 +41,7 @@ from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.errors import UserError
 from maplab_py.geometry import yaw
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import VIMap, to_hex
+from maplab_py.vimap import VIMap, mission_mask, to_hex
 
 _DEFAULT = AnchoringOptions()
 _ABSOLUTE = AbsoluteAnchoringOptions()
@@ -78,7 +78,7 @@ def anchor_missions(
     """
     names = [to_hex(words)[:8] for words in vi_map.missions.id]
     known = vi_map.baseframes.is_known[vi_map.missions.baseframe]
-    wanted = _unknown(known, missions)
+    wanted = mission_mask(vi_map, missions) & ~known
     vi_map, measured, refused = anchor_by_absolute_poses(vi_map, wanted, absolute)
     by_poses = tuple(names[i] for i in np.flatnonzero(measured))
     refusals = tuple(f"{names[i]}: {reason}" for i, reason in refused.items())
@@ -138,13 +138,6 @@ def _between_missions(
         scope=features.SearchScope(projections=projections),
         progress=progress,
     )
-
-
-def _unknown(known: NDArray[np.bool_], missions: I64 | None) -> NDArray[np.bool_]:
-    """Return which of some missions (rows, None = all) have no known base frame (M,)."""
-    chosen = np.zeros(len(known), dtype=np.bool_)
-    chosen[slice(None) if missions is None else missions] = True
-    return np.asarray(chosen & ~known)
 
 
 def _nothing_to_do(

@@ -6,7 +6,7 @@ from functools import reduce
 import numpy as np
 
 from maplab_py.algorithms.cells.options import CellOptions
-from maplab_py.array_types import F64, I32, I64, Mask, NDArray
+from maplab_py.array_types import F64, I32, I64, Mask, NDArray, mask_of
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.progress import SILENT, Progress
@@ -101,8 +101,7 @@ def _cell(vi_map: VIMap, is_inside: Mask) -> VIMap:
     per_mission = np.bincount(vi_map.vertices.mission[is_inside], minlength=len(vi_map.missions))
     keypoints = vi_map.observations
     observed = vi_map.keypoints.landmark[keypoints[is_inside[vi_map.keypoint_vertex[keypoints]]]]
-    is_seen = np.zeros(len(vi_map.landmarks), dtype=np.bool_)
-    is_seen[observed] = True
+    is_seen = mask_of(len(vi_map.landmarks), observed)
     is_seen |= (np.diff(vi_map.observation_start) == 0) & is_inside[vi_map.landmarks.vertex]
     seen = remove_landmarks(vi_map, ~is_seen)
     kept = is_inside[(per_mission > 0)[vi_map.vertices.mission]]

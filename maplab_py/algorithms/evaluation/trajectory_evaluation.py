@@ -11,7 +11,7 @@ from maplab_py.errors import EstimationError
 from maplab_py.geometry import interpolation, se3, so3
 from maplab_py.interop.trajectories import Trajectory
 from maplab_py.progress import SILENT, Progress
-from maplab_py.vimap import VIMap, ids
+from maplab_py.vimap import VIMap, ids, mission_mask
 
 _MIN_MATCHED = 3
 _LEAST_CLOCK_S = 0.005
@@ -45,7 +45,7 @@ def evaluate_trajectory(
         EstimationError: Fewer than three vertices have ground truth, or they cannot be aligned.
     """
     progress.check()
-    rows = _vertex_rows(vi_map, missions)
+    rows = np.flatnonzero(mission_mask(vi_map, missions)[vi_map.vertices.mission])
     T_R_B, matched = match(ground_truth, vi_map.vertices.timestamp_ns[rows], options)
     if np.count_nonzero(matched) < _MIN_MATCHED:
         message = _no_match_message(vi_map, rows, ground_truth, matched)
@@ -184,14 +184,6 @@ def match(
     gap_ns = max(2 * tolerance_ns, _GAP_STEPS * usual_step_ns, 1)
     T_R_B, inside = interpolation.interpolate_poses(stamps, poses, times_ns, max_gap_ns=gap_ns)
     return T_R_B, is_near & inside
-
-
-def _vertex_rows(vi_map: VIMap, missions: NDArray[np.integer] | None) -> I64:
-    if missions is None:
-        return np.arange(len(vi_map.vertices), dtype=np.int64)
-    chosen = np.zeros(len(vi_map.missions), dtype=np.bool_)
-    chosen[missions] = True
-    return np.flatnonzero(chosen[vi_map.vertices.mission])
 
 
 def _no_match_message(

@@ -12,7 +12,7 @@ from maplab_py.algorithms.evaluation import plausibility, trajectory_evaluation
 from maplab_py.algorithms.evaluation.options import TrajectoryEvaluationOptions
 from maplab_py.algorithms.external_poses import alignment
 from maplab_py.algorithms.external_poses.options import TrajectoryImport, TrajectoryOptions
-from maplab_py.array_types import F64, I64, U64, Mask
+from maplab_py.array_types import F64, I64, U64, Mask, mask_of
 from maplab_py.errors import EstimationError, MapError, UserError
 from maplab_py.geometry import se3
 from maplab_py.geometry.interpolation import interpolate_poses
@@ -58,8 +58,7 @@ def as_absolute_poses(
     rows = np.arange(vi_map.vertex_start[mission], vi_map.vertex_start[mission + 1])
     stamps = vi_map.vertices.timestamp_ns[rows]
     T_G_S, covered = _at(trajectory, stamps, options)
-    chosen = np.zeros(len(rows), dtype=np.bool_)
-    chosen[nearest(stamps, trajectory.times_ns)] = True
+    chosen = mask_of(len(rows), nearest(stamps, trajectory.times_ns))
     chosen &= covered
     if not chosen.any():
         raise _no_overlap(vi_map, rows, trajectory, options)

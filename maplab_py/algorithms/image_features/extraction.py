@@ -10,7 +10,7 @@ import numpy as np
 from maplab_py.algorithms.dense.resources import IMAGES, FrameResources, check_size
 from maplab_py.algorithms.image_features import keypoint_edits
 from maplab_py.algorithms.image_features.options import PLUGIN, ExtractionOptions, ExtractionReport
-from maplab_py.array_types import I64, U8, Mask
+from maplab_py.array_types import I64, U8, Mask, mask_of
 from maplab_py.child_processes import in_order
 from maplab_py.errors import MapError, MaplabError, UserError
 from maplab_py.memory import require_memory
@@ -65,8 +65,7 @@ def extract_features(
         frames = frames[new]
     result = vi_map
     if options.replace and kind is not None:
-        chosen = np.zeros(len(vi_map.frames), dtype=np.bool_)
-        chosen[frames] = True
+        chosen = mask_of(len(vi_map.frames), frames)
         result = keypoint_edits.without_kind(vi_map, chosen, kind)
     removed = len(vi_map.keypoints) - len(result.keypoints)
     counts = np.array([len(part.scores) for part in features], dtype=np.int64)

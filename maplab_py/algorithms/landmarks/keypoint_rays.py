@@ -5,13 +5,13 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
+from maplab_py.algorithms.landmarks.sightings import cameras_of
 from maplab_py.array_types import F64, I64, Mask
-from maplab_py.distinct import distinct
 from maplab_py.geometry import se3, so3, symmetric
 from maplab_py.sensors import Camera, Projection
 from maplab_py.sensors.camera import Distortion
 from maplab_py.sensors.projection import back_project
-from maplab_py.vimap import MissionSensor, VIMap, ragged_rows, to_hex
+from maplab_py.vimap import VIMap, ragged_rows
 from maplab_py.vision.point_covariance import covariance_by_rays
 
 _TILE_PX = 4.0
@@ -20,29 +20,17 @@ _TILES_PER_KEYPOINT = 4
 _FARTHEST_PX = 1e6  # no image is larger: tiles keep within `_TILES`
 """With more keypoints all tiles of an image are computed, and kept for the next time."""
 _CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-_SENSORS = [MissionSensor.IMU, MissionSensor.NCAMERA]
 
 
 def keypoint_rays(vi_map: VIMap, keypoints: I64) -> tuple[F64, F64, F64, Mask]:
     """Return camera centres and rays in I, the angle of a pixel [rad], and which rays exist."""
-    frame = vi_map.keypoint_frame[keypoints]
-    rigs, rig_of_mission = np.unique(
-        vi_map.missions.sensor_id[:, _SENSORS], axis=0, return_inverse=True
-    )
-    rig = rig_of_mission[vi_map.vertices.mission[vi_map.frames.vertex[frame]]]
-    camera_index = vi_map.frames.camera_index[frame]
     origin, ray = np.zeros((len(keypoints), 3)), np.zeros((len(keypoints), 3))
     rad_per_px, valid = np.ones(len(keypoints)), np.zeros(len(keypoints), dtype=np.bool_)
-    uv = vi_map.keypoints.uv_px[keypoints]
-    for row in distinct(rig):
-        imu, ncamera = map(to_hex, rigs[row])
-        T_I_C = vi_map.sensors.T_I_C(imu, ncamera)
-        for index, camera in enumerate(vi_map.sensors.camera_rig(ncamera).cameras):
-            mine = np.flatnonzero((rig == row) & (camera_index == index))
-            bearing, angle, ok = bearings(camera, uv[mine])
-            origin[mine] = T_I_C[index, 4:]
-            ray[mine] = so3.rotate(T_I_C[index, :4], bearing)
-            rad_per_px[mine], valid[mine] = angle, ok
+    for camera, T_I_C, rows in cameras_of(vi_map, keypoints):
+        bearing, rad_per_px[rows], valid[rows] = bearings(
+            camera, vi_map.keypoints.uv_px[keypoints[rows]]
+        )
+        origin[rows], ray[rows] = T_I_C[4:], so3.rotate(T_I_C[:4], bearing)
     return origin, ray, rad_per_px, valid
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from maplab_py.algorithms.landmarks.keypoint_rays import keypoint_rays
 from maplab_py.algorithms.loop_closure.reports import TrainingReport
-from maplab_py.array_types import F64, I32, I64, U8, Mask
+from maplab_py.array_types import F64, I32, I64, U8, Mask, mask_of
 from maplab_py.distinct import distinct
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3
@@ -345,8 +345,7 @@ def _features(vi_map: VIMap, vertices: I64 | None) -> tuple[int, I64]:
     size = int(np.argmax(by_size))
     if vertices is None:
         return size, np.flatnonzero((sizes == size) & (size > 0))
-    is_in = np.zeros(len(vi_map.vertices), dtype=np.bool_)
-    is_in[vertices] = True
+    is_in = mask_of(len(vi_map.vertices), vertices)
     return size, np.flatnonzero((sizes == size) & (size > 0) & is_in[vi_map.keypoint_vertex])
 
 

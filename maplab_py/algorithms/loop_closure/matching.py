@@ -19,7 +19,7 @@ import numpy as np
 from maplab_py.algorithms.loop_closure.candidates import Matches
 from maplab_py.algorithms.loop_closure.features import MapFeatures
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.array_types import I32, I64, NDArray
+from maplab_py.array_types import I32, I64, NDArray, mask_of
 from maplab_py.distinct import distinct
 from maplab_py.memory import available_bytes
 from maplab_py.vision.descriptors import differences
@@ -135,8 +135,7 @@ class _Search:
         parts = [np.zeros((3, 0), dtype=np.int32)]
         for mission in range(size):
             in_mission = self.database[d.session[self.database] == mission]
-            wants = np.zeros(int(vertex.max()) + 1, dtype=np.bool_)
-            wants[chosen[chosen % size == mission] // size] = True
+            wants = mask_of(int(vertex.max()) + 1, chosen[chosen % size == mission] // size)
             is_asked = (d.session[self.queries] == mission) | wants[vertex[self.queries]]
             if len(in_mission) and is_asked.any():
                 asked = self.queries[is_asked]

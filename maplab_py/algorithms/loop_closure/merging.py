@@ -13,7 +13,7 @@ from maplab_py.algorithms.loop_closure.features import points_in_mission
 from maplab_py.algorithms.loop_closure.guided_matching import LandmarkMatches, guided_matches
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.reports import GAP, UNKNOWN_BASE_FRAME
-from maplab_py.array_types import F64, I64, Mask, NDArray, Rows
+from maplab_py.array_types import F64, I64, Mask, NDArray, Rows, mask_of
 from maplab_py.distinct import distinct
 from maplab_py.geometry import se3, so3
 from maplab_py.vimap import VIMap, edits, observer_counts, ragged_rows, starts_of_counts
@@ -278,8 +278,7 @@ def unite(vi_map: VIMap, votes: Votes, min_votes: int) -> United:
         fits = fits[links.shape[1] :]
         if not fits.any():
             break
-        is_united = np.zeros(len(pairs.votes) + 1, dtype=np.bool_)
-        is_united[order[fits]] = True
+        is_united = mask_of(len(pairs.votes) + 1, order[fits])
         vote = np.flatnonzero(is_united[pairs.of_vote])
         of_vote = pairs.of_vote[vote]
         parts.append(

@@ -17,7 +17,7 @@ from maplab_py.algorithms.loop_closure.closure_record import (
 )
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.reports import ClosureRemovalReport, Verdict
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64, Mask, mask_of
 from maplab_py.distinct import distinct
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3
@@ -245,10 +245,8 @@ def _restore(
     present = vi_map.landmark_index.rows(lm.id)  # survivors
     vertex = vi_map.vertex_index.rows(lm.vertex)
     # a group without surviving member restores one of its members
-    alive = np.zeros(len(lm) + 1, dtype=np.bool_)
-    alive[label[present >= 0]] = True
-    has_survivor = np.zeros(len(lm) + 1, dtype=np.bool_)
-    has_survivor[united[present >= 0]] = True
+    alive = mask_of(len(lm) + 1, label[present >= 0])
+    has_survivor = mask_of(len(lm) + 1, united[present >= 0])
     orphan = np.flatnonzero(~alive[label] & (vertex >= 0) & has_survivor[united])
     _, first = np.unique(label[orphan], return_index=True)
     back = orphan[first]

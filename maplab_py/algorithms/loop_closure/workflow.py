@@ -11,7 +11,7 @@ from maplab_py.algorithms.loop_closure.detection import Detection, detect
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.record_updates import with_closures
 from maplab_py.algorithms.loop_closure.reports import GAP, LoopClosureReport
-from maplab_py.array_types import I64
+from maplab_py.array_types import I64, mask_of
 from maplab_py.distinct import distinct
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import counted
@@ -52,8 +52,7 @@ def close_loops(
     detection = _detect(judged, options, missions, progress, scope)
     closures = detection.closures
     merged, result = merging.merge_verified_landmarks(judged, closures, options)
-    used = np.zeros(len(closures), dtype=np.bool_)
-    used[result.closure] = True
+    used = mask_of(len(closures), result.closure)
     recorded = with_closures(merged, closures, "merge", used=used, merges=result, before=judged)
     report = dataclasses.replace(
         describe(judged, detection, options, notes),

@@ -13,7 +13,7 @@ import numpy as np
 from maplab_py.algorithms.landmarks.evidence import session_times_s
 from maplab_py.algorithms.map_update.options import Change, ChangeReport
 from maplab_py.algorithms.map_update.visibility import Sightings, outcome, predict
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64, Mask, mask_of
 from maplab_py.errors import UserError
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap, to_hex_list
@@ -106,9 +106,7 @@ def seen_by(vi_map: VIMap, missions: Mask) -> Mask:
     """Return which landmarks (L,) missions (M,) observe."""
     keypoints = vi_map.observations
     mine = missions[vi_map.vertices.mission[vi_map.keypoint_vertex[keypoints]]]
-    result = np.zeros(len(vi_map.landmarks), dtype=np.bool_)
-    result[vi_map.keypoints.landmark[keypoints[mine]]] = True
-    return result
+    return mask_of(len(vi_map.landmarks), vi_map.keypoints.landmark[keypoints[mine]])
 
 
 def missing_regions(

@@ -12,7 +12,7 @@ from maplab_py.algorithms.sparsification import selection
 from maplab_py.algorithms.sparsification.options import SparsificationOptions
 from maplab_py.algorithms.sparsification.sparsify import sparsify
 from maplab_py.algorithms.statistics.statistics import bytes_by_kind
-from maplab_py.array_types import F64, I64, Mask, NDArray
+from maplab_py.array_types import F64, I64, Mask, NDArray, mask_of
 from maplab_py.distinct import distinct
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3
@@ -185,8 +185,7 @@ def with_odometry_instead_of_imu(vi_map: VIMap, missions: I64) -> VIMap:
     missions = missions[vi_map.missions.backbone[missions] == tables.Backbone.VIWLS]
     if len(missions) == 0:
         return vi_map
-    is_old = np.zeros(len(vi_map.missions), dtype=np.bool_)
-    is_old[missions] = True
+    is_old = mask_of(len(vi_map.missions), missions)
     mission = vi_map.vertices.mission
     first = np.flatnonzero((mission[1:] == mission[:-1]) & is_old[mission[:-1]])
     sensors, of_mission = _odometry_sensors(vi_map, missions)

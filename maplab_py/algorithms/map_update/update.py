@@ -41,7 +41,7 @@ from maplab_py.algorithms.map_update.options import (
 )
 from maplab_py.algorithms.vi_optimization import local, optimization
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
-from maplab_py.array_types import I64, NDArray
+from maplab_py.array_types import I64, NDArray, mask_of
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import counted
@@ -123,8 +123,7 @@ def update_map(
     for mission in whole.mission_index.rows(new_ids).tolist():
         whole, line = gather(whole, mission, persistence, progress=progress)
         lines.append(line)
-    is_new = np.zeros(len(whole.missions), dtype=np.bool_)
-    is_new[whole.mission_index.rows(new_ids)] = True
+    is_new = mask_of(len(whole.missions), whole.mission_index.rows(new_ids))
     result, thinned = thinning.thin(whole, is_new, options, persistence, progress)
     result = chronicle.stored_order(result)
     report = MapUpdateReport(
@@ -226,8 +225,7 @@ def changes_since(
         renamed = edits.with_new_ids(session, edits.content_rng(vi_map, "changes", session))
     prepared = prepare_session(renamed, progress=progress)
     whole, *_ = merge_session(vi_map, prepared, progress=progress)
-    later = np.zeros(len(whole.missions), dtype=np.bool_)
-    later[whole.mission_index.rows(prepared.missions.id)] = True
+    later = mask_of(len(whole.missions), whole.mission_index.rows(prepared.missions.id))
     report = changes.find_changes(whole, later, progress)
     if shared:
         names = to_hex_list(renamed.vertices.id), to_hex_list(session.vertices.id)

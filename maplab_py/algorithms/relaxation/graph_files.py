@@ -8,7 +8,7 @@ import numpy as np
 
 from maplab_py.algorithms.relaxation import map_edges
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
-from maplab_py.array_types import F64, U64, Mask, NDArray
+from maplab_py.array_types import F64, U64, Mask, NDArray, mask_of
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.g2o import PoseGraph
@@ -39,8 +39,7 @@ def is_odometry(graph: PoseGraph) -> Mask:
     chain = np.abs(graph.second - graph.first) == 1
     chain &= robot[graph.first] == robot[graph.second]
     _, earliest = np.unique(np.where(chain, before, -1), return_index=True)
-    is_first = np.zeros(len(chain), dtype=np.bool_)
-    is_first[earliest] = True
+    is_first = mask_of(len(chain), earliest)
     return np.asarray(chain & is_first)
 
 
@@ -73,8 +72,7 @@ def map_of_graph(graph: PoseGraph) -> VIMap:
     rng = np.random.default_rng(int.from_bytes(content.digest(), "little"))
     chain, vertices, ids = is_odometry(graph), len(graph.id), graph.id.astype(np.uint64)
     graph = _turned(graph, chain & (graph.first > graph.second))
-    follows = np.zeros(vertices, dtype=np.bool_)
-    follows[graph.second[chain]] = True
+    follows = mask_of(vertices, graph.second[chain])
     first = np.flatnonzero(~follows)
     mission, count = np.cumsum(~follows) - 1, len(first)
     covariance = _split_covariance(np.linalg.inv(graph.information), graph.T_A_B)

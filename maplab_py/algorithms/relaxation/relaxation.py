@@ -27,7 +27,7 @@ from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.relaxation import map_edges
 from maplab_py.algorithms.relaxation.options import RelaxationOptions, RelaxationReport, SwitchedOff
 from maplab_py.algorithms.relaxation.robust import Solution, optimize_robustly
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64, Mask, mask_of
 from maplab_py.estimation.problem.gauge import clusters
 from maplab_py.estimation.terms.pose_graph import TiltPriors
 from maplab_py.geometry import se3, so3
@@ -138,8 +138,7 @@ def _move_base_frames(vi_map: VIMap, rows: I64, anchors: I64, T_G_I: F64) -> tup
     Those of missions that hold an anchor stay, unknown ones, and those that missions share.
     """
     missions, start = vi_map.missions, vi_map.vertex_start
-    is_moving = np.zeros(len(missions), dtype=np.bool_)
-    is_moving[vi_map.vertices.mission[rows]] = True
+    is_moving = mask_of(len(missions), vi_map.vertices.mission[rows])
     is_moving[vi_map.vertices.mission[anchors]] = False
     users = np.bincount(missions.baseframe, minlength=len(vi_map.baseframes))
     is_unshared = vi_map.baseframes.is_known & (users == 1)

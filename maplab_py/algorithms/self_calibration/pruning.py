@@ -60,35 +60,23 @@ def prune(
         EstimationError: Half of the segments contradict their joint calibration.
         UserError: A mission is unknown, or the calibration is of other cameras.
     """
-    result, tests = database, list[SegmentTest]()
+    result, tests = database, list[reports.PrunedSegment]()
     if missions:
         prefixes = tuple(missions)
         removed = {r.mission for r in database.records if r.mission.startswith(prefixes)}
         if not removed:
             raise UserError(f"--missions: the database has no segment of {','.join(missions)}")
         result = result.without_missions(removed)
-    tested = result
     if outdated:
         if calibration is None:
-            tests = test_mutual_consistency(tested, options, probability, progress)
+            tests = test_mutual_consistency(result, options, probability, progress)
         else:
-            tests = test_segments(tested, calibration, options, probability, progress)
-        pairs = zip(tested.records, tests, strict=True)
-        result = result.with_only([record.key for record, test in pairs if not test.is_outdated])
+            tests = test_segments(result, calibration, options, probability, progress)
+        pairs = zip(result.records, tests, strict=True)
+        result = result.with_only([record.key for record, test in pairs if not test.outdated])
     if capacity:
         result = result.pruned(capacity)
-    rows = (
-        reports.PrunedSegment(
-            mission=record.mission[:8],
-            first_vertex=record.first_vertex[:8],
-            distance=test.distance,
-            limit=test.limit,
-            chi_square_per_freedom=test.chi_square_per_freedom,
-            outdated=test.is_outdated,
-        )
-        for record, test in zip(tested.records if tests else (), tests, strict=True)
-    )
-    return result, reports.PruneReport(len(database), len(result), tuple(rows))
+    return result, reports.PruneReport(len(database), len(result), tuple(tests))
 
 
 def test_mutual_consistency(
@@ -96,7 +84,7 @@ def test_mutual_consistency(
     options: SelfCalibrationOptions,
     probability: float,
     progress: Progress,
-) -> list[SegmentTest]:
+) -> list[reports.PrunedSegment]:
     """Test every segment against the joint calibration of all segments.
 
     Raises:
@@ -108,7 +96,7 @@ def test_mutual_consistency(
     lenient = dataclasses.replace(options, keep_unobservable_at_prior=True)
     result, _ = calibrate(database.vi_map, lenient, segments=len(database), progress=progress)
     tests = test_segments(database, result.sensors, options, probability, progress)
-    against = sum(test.is_outdated for test in tests)
+    against = sum(test.outdated for test in tests)
     if 2 * against >= len(tests):
         raise EstimationError(
             f"{against} of {len(tests)} segments contradict what all say together, so the device may "
@@ -123,8 +111,14 @@ def test_segments(
     options: SelfCalibrationOptions,
     probability: float,
     progress: Progress,
-) -> list[SegmentTest]:
-    """Test every segment against a calibration.
+) -> list[reports.PrunedSegment]:
+    """Test the measurements of every segment against a calibration.
+
+    A segment is calibrated alone, from that calibration, with the same treatment of outliers as in a
+    joint calibration. Under the hypothesis that the calibration is right, the change has a chi-square
+    distributed Mahalanobis distance. Its covariance is as large as the formal one, scaled by the fit,
+    and the cluster-robust one. Directions that the segment does not determine are held by the prior
+    and are not tested.
 
     Args:
         sensors: The calibration; of other ids, when it has one IMU and one rig.
@@ -133,47 +127,26 @@ def test_segments(
     Raises:
         UserError: The calibration is of other cameras, or it is not clear of which.
     """
+    from scipy.stats import chi2
+
     tests = []
     for number, record in enumerate(database.records):
         progress.step(number, len(database), "test segments")
         segment = device.transfer_calibration(database.map_of(record), sensors)
-        tests.append(test_segment(segment, options, probability))
+        estimate = estimate_segment(segment, options)
+        distance, freedom = estimate.squared_distance()
+        limit = float(chi2.ppf(probability, max(freedom, 1)))
+        tests.append(
+            reports.PrunedSegment(
+                mission=record.mission[:8],
+                first_vertex=record.first_vertex[:8],
+                distance=distance,
+                limit=limit,
+                chi_square_per_freedom=estimate.fit,
+                outdated=bool(freedom and distance > limit),
+            )
+        )
     return tests
-
-
-@dataclasses.dataclass(frozen=True)
-class SegmentTest:
-    """Agreement of a segment with a calibration."""
-
-    distance: float  # squared Mahalanobis distance of the segment's own estimate
-    limit: float  # of the distance, at the chosen probability
-    chi_square_per_freedom: float
-    is_outdated: bool  # the distance is beyond the limit
-
-
-def test_segment(
-    segment: VIMap, options: SelfCalibrationOptions, probability: float
-) -> SegmentTest:
-    """Test the measurements of a segment against the calibration in its sensors.
-
-    The segment is calibrated alone, from that calibration, with the same treatment of outliers as in a
-    joint calibration. Under the hypothesis that the calibration is right, the change has a chi-square
-    distributed Mahalanobis distance. Its covariance is as large as the formal one, scaled by the fit,
-    and the cluster-robust one. Directions that the segment does not determine are held by the prior
-    and are not tested.
-
-    Args:
-        segment: Map of a segment; its sensors have the calibration to test.
-        probability: Of accepting a segment if the calibration is right.
-    """
-    from scipy.stats import chi2
-
-    estimate = estimate_segment(segment, options)
-    distance, freedom = squared_distance(
-        estimate.change, estimate.formal, estimate.actual, estimate.parameters
-    )
-    limit = float(chi2.ppf(probability, max(freedom, 1)))
-    return SegmentTest(distance, limit, estimate.fit, bool(freedom and distance > limit))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -185,6 +158,20 @@ class SegmentEstimate:
     formal: F64  # (k, k) posterior covariance, by which the prior is weighted against the data
     actual: F64  # (k, k) as large as the formal one, scaled by the fit, and the cluster-robust one
     fit: float  # chi-square per degree of freedom
+
+    def squared_distance(self) -> tuple[float, int]:
+        """Return the squared distance along the directions that the data determine, and their number."""
+        scale, eigen = self.parameters.prior_sigma, spectrum(self.formal, self.parameters)
+        determined = eigen.prior_share <= MAX_PRIOR_SHARE
+        if not determined.any():
+            return 0.0, 0
+        basis = eigen.directions[:, determined]
+        # the prior shrinks an estimate towards the calibration; its variance shrinks likewise
+        root = np.sqrt(1.0 - eigen.prior_share[determined])
+        actual = self.actual / np.outer(scale, scale)
+        variance = root[:, None] * (basis.T @ actual @ basis) * root
+        along = basis.T @ (self.change / scale)
+        return float(along @ np.linalg.solve(variance, along)), int(determined.sum())
 
 
 def estimate_segment(segment: VIMap, options: SelfCalibrationOptions) -> SegmentEstimate:
@@ -209,26 +196,3 @@ def estimate_segment(segment: VIMap, options: SelfCalibrationOptions) -> Segment
     if not all(np.isfinite(values).all() for values in (change, formal, actual)):
         raise EstimationError("a segment has no more measurements than unknowns: was it at rest?")
     return SegmentEstimate(parameters, change, formal, actual, fit)
-
-
-def squared_distance(
-    change: F64, formal: F64, actual: F64, parameters: Parameters
-) -> tuple[float, int]:
-    """Return the squared distance along the directions that the data determine, and their number.
-
-    Args:
-        change: (k,) of the segment's estimate from the calibration.
-        formal: Covariance (k, k) by which the prior is weighted against the data.
-        actual: Covariance (k, k) of the errors of the data.
-        parameters: What was estimated, with the prior deviations.
-    """
-    scale, eigen = parameters.prior_sigma, spectrum(formal, parameters)
-    determined = eigen.prior_share <= MAX_PRIOR_SHARE
-    if not determined.any():
-        return 0.0, 0
-    basis = eigen.directions[:, determined]
-    # the prior shrinks an estimate towards the calibration; its variance shrinks likewise
-    root = np.sqrt(1.0 - eigen.prior_share[determined])
-    variance = root[:, None] * (basis.T @ (actual / np.outer(scale, scale)) @ basis) * root
-    along = basis.T @ (change / scale)
-    return float(along @ np.linalg.solve(variance, along)), int(determined.sum())

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64, Mask, mask_of
 from maplab_py.errors import EstimationError
 from maplab_py.vimap.table import starts_of_counts
 
@@ -107,8 +107,7 @@ class CoverageProblem:
             landmarks: Rows (P,), sorted.
             chosen: The current selection (L,); the subproblem selects the same number of the rows.
         """
-        inside = np.zeros(self.landmarks, dtype=np.bool_)
-        inside[landmarks] = True
+        inside = mask_of(self.landmarks, landmarks)
         row = np.cumsum(inside) - 1
         pairs = np.flatnonzero(inside[self.landmark])
         keyframes, keyframe = np.unique(self.keyframe[pairs], return_inverse=True)
@@ -137,13 +136,13 @@ def level_values(levels: int) -> F64:
 def choose_random(problem: CoverageProblem, seed: int) -> Mask:
     """Select landmarks at random."""
     rows = np.random.default_rng(seed).permutation(problem.landmarks)[: problem.keep]
-    return _mask(problem, rows)
+    return mask_of(problem.landmarks, rows)
 
 
 def choose_most_observed(problem: CoverageProblem) -> Mask:
     """Select the landmarks that most keyframes observe; the score breaks ties."""
     seers = np.bincount(problem.landmark, minlength=problem.landmarks)
-    return _mask(problem, np.lexsort((-problem.score, -seers))[: problem.keep])
+    return mask_of(problem.landmarks, np.lexsort((-problem.score, -seers))[: problem.keep])
 
 
 def choose_greedily(problem: CoverageProblem, start: Mask | None = None) -> Mask:
@@ -209,12 +208,6 @@ def exchange(problem: CoverageProblem, chosen: Mask, *, most: int = 2000) -> Mas
             break
         cover[keyframe[offset[drop] : offset[drop + 1]]] -= problem.weight[drop]
         objective = now
-    return chosen
-
-
-def _mask(problem: CoverageProblem, rows: I64) -> Mask:
-    chosen = np.zeros(problem.landmarks, dtype=np.bool_)
-    chosen[rows] = True
     return chosen
 
 

@@ -19,7 +19,7 @@ from maplab_py.algorithms.sparsification.options import (
     SparsificationOptions,
     SparsificationReport,
 )
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64, Mask, mask_of
 from maplab_py.distinct import distinct
 from maplab_py.errors import UserError
 from maplab_py.memory import require_memory
@@ -83,8 +83,7 @@ def sparsify(
         notes = (*notes, f"all {len(good)} good landmarks stay: no more than {keep}")
     else:
         solution, parts = choose(problem, options, progress)
-    kept = np.zeros(len(judged.landmarks), dtype=np.bool_)
-    kept[good[solution.chosen]] = True
+    kept = mask_of(len(judged.landmarks), good[solution.chosen])
     result = edits.remove_landmarks(judged, ~kept)
     coverage = _coverage(problem, vertex, solution.chosen, options)
     report = SparsificationReport(

@@ -143,9 +143,7 @@ def select(vi_map: VIMap, options: DataOptions, missions: NDArray[np.integer] | 
 
     Observations beyond the limits of the options are left out, see `thinning`.
     """
-    chosen = np.zeros(len(vi_map.missions), dtype=np.bool_)
-    chosen[slice(None) if missions is None else missions] = True
-    is_in = chosen[vi_map.vertices.mission]
+    is_in = queries.mission_mask(vi_map, missions)[vi_map.vertices.mission]
     vertices = np.flatnonzero(is_in)
     row_of_vertex = np.full(len(vi_map.vertices), -1, dtype=np.int64)
     row_of_vertex[vertices] = np.arange(len(vertices))

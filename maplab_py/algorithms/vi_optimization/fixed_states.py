@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from maplab_py.array_types import I64
+from maplab_py.array_types import I64, mask_of
 from maplab_py.distinct import distinct
 from maplab_py.estimation.problem import gauge
 from maplab_py.estimation.problem.problem import Problem
@@ -56,8 +56,7 @@ def fix_gauge(
     """
     num_vertices = len(states.T_G_I)
     labels = gauge.clusters(num_vertices, _links(problem, num_vertices))
-    is_held = np.zeros(num_vertices, dtype=np.bool_)
-    is_held[held] = True
+    is_held = mask_of(num_vertices, held)
     anchored = _labels_of(labels, problem, pose.AbsolutePoseTerm)
     if any(isinstance(t, prior.PosePrior) and t.determines_poses for t in problem.factors):
         anchored |= _labels_of(labels, problem, prior.PosePrior)
@@ -130,14 +129,8 @@ def _labels_of_rigs(labels: I64, problem: Problem) -> set[int]:
 
 def _labels_with_scale(labels: I64, problem: Problem) -> set[int]:
     """Return the clusters with factors that know distances; wheels of unknown scale do not."""
-    result: set[int] = set()
-    for term in problem.factors:
-        if isinstance(term, wheel.ScaledRelativePoseTerm):
-            continue
-        vertices = _vertices_of(term, len(labels))
-        if vertices is not None:
-            result.update(np.unique(labels[vertices]).tolist())
-    return result
+    kinds = {type(term) for term in problem.factors} - {wheel.ScaledRelativePoseTerm}
+    return _labels_of(labels, problem, *kinds)
 
 
 def _vertices_of(term: protocol.FactorTerm, num_vertices: int) -> I64 | None:

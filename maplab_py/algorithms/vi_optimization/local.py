@@ -13,7 +13,7 @@ import numpy as np
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
 from maplab_py.algorithms.vi_optimization.reports import VIOptimizationReport
-from maplab_py.array_types import I64, Mask
+from maplab_py.array_types import I64, Mask, mask_of
 from maplab_py.distinct import distinct
 from maplab_py.progress import SILENT, Progress
 from maplab_py.vimap import VIMap, excerpts
@@ -50,8 +50,7 @@ def optimize_around(
     Raises:
         EstimationError: Nothing can be optimised.
     """
-    is_new = np.zeros(len(vi_map.vertices), dtype=np.bool_)
-    is_new[vertices] = True
+    is_new = mask_of(len(vi_map.vertices), vertices)
     is_known = vi_map.baseframes.is_known[vi_map.missions.baseframe][vi_map.vertices.mission]
     missions = distinct(vi_map.vertices.mission[vertices])
     usable = is_known | np.isin(vi_map.vertices.mission, missions)
@@ -70,14 +69,11 @@ def _most_shared(vi_map: VIMap, seeds: Mask, wanted: Mask, count: int) -> Mask:
     """Return up to `count` wanted vertices (V,) that share most landmarks with the seeds."""
     keypoints = vi_map.observations
     landmark, vertex = vi_map.keypoints.landmark[keypoints], vi_map.keypoint_vertex[keypoints]
-    is_seen = np.zeros(len(vi_map.landmarks), dtype=np.bool_)
-    is_seen[landmark[seeds[vertex]]] = True
+    is_seen = mask_of(len(vi_map.landmarks), landmark[seeds[vertex]])
     shared = np.bincount(vertex[is_seen[landmark]], minlength=len(vi_map.vertices))
     shared[~wanted | (shared < _MIN_SHARED)] = 0
     order = np.argsort(-shared, kind="stable")[:count]
-    result = np.zeros(len(vi_map.vertices), dtype=np.bool_)
-    result[order[shared[order] > 0]] = True
-    return result
+    return mask_of(len(vi_map.vertices), order[shared[order] > 0])
 
 
 def _neighbours(vi_map: VIMap, is_free: Mask) -> Mask:

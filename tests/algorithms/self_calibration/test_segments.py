@@ -17,7 +17,7 @@ from maplab_py.algorithms.self_calibration.estimation.problem import (
     split_landmarks,
 )
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
-from maplab_py.algorithms.self_calibration.pruning import SegmentTest
+from maplab_py.algorithms.self_calibration.reports import PrunedSegment
 from maplab_py.algorithms.self_calibration.segments.database import (
     SegmentDatabase,
     load_database,
@@ -323,13 +323,13 @@ def renamed(sensors: SensorSet) -> SensorSet:
 
 def results_of(
     database: SegmentDatabase, sensors: SensorSet, options: SelfCalibrationOptions
-) -> list[SegmentTest]:
+) -> list[PrunedSegment]:
     return pruning.test_segments(database, sensors, options, pruning.PROBABILITY, SILENT)
 
 
 def mutual_results_of(
     database: SegmentDatabase, options: SelfCalibrationOptions
-) -> list[SegmentTest]:
+) -> list[PrunedSegment]:
     return pruning.test_mutual_consistency(database, options, pruning.PROBABILITY, SILENT)
 
 
@@ -343,16 +343,16 @@ def test_a_calibration_of_other_cameras_is_not_passed_over() -> None:
 def test_segments_of_a_device_that_changed_are_found() -> None:
     database = collected()
     sensors = database.vi_map.sensors
-    assert not any(one.is_outdated for one in results_of(database, sensors, OPTIONS))
-    assert all(one.is_outdated for one in results_of(database, knocked(sensors), OPTIONS))
-    assert all(one.is_outdated for one in results_of(database, renamed(knocked(sensors)), OPTIONS))
+    assert not any(one.outdated for one in results_of(database, sensors, OPTIONS))
+    assert all(one.outdated for one in results_of(database, knocked(sensors), OPTIONS))
+    assert all(one.outdated for one in results_of(database, renamed(knocked(sensors)), OPTIONS))
 
 
 @pytest.mark.slow
 def test_a_calibration_that_was_wrong_from_the_start_makes_no_segment_outdated() -> None:
     database, _ = collect(uncalibrated(scene_map(vertices=61, noise=1.0)), OPTIONS)
-    assert all(one.is_outdated for one in results_of(database, database.vi_map.sensors, OPTIONS))
-    assert not any(one.is_outdated for one in mutual_results_of(database, OPTIONS))
+    assert all(one.outdated for one in results_of(database, database.vi_map.sensors, OPTIONS))
+    assert not any(one.outdated for one in mutual_results_of(database, OPTIONS))
 
 
 @pytest.mark.slow
@@ -363,9 +363,9 @@ def test_segments_from_before_and_after_a_knock_are_told_apart() -> None:
     database, _ = collect(seen_by(second_session(), now), many, first)
     is_first = [one.mission in {r.mission for r in first.records} for one in database.records]
     assert 0 < sum(is_first) < len(is_first)
-    assert [one.is_outdated for one in results_of(database, held, many)] == [
+    assert [one.outdated for one in results_of(database, held, many)] == [
         not one for one in is_first
     ]
-    assert [one.is_outdated for one in results_of(database, now, many)] == is_first
+    assert [one.outdated for one in results_of(database, now, many)] == is_first
     with pytest.raises(EstimationError, match=r"changed between sessions.*--calibration"):
         mutual_results_of(database, many)

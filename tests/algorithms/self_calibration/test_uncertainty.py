@@ -16,7 +16,8 @@ from maplab_py.algorithms.self_calibration.estimation.problem import (
     build_segment_problem,
     runs_of,
 )
-from maplab_py.algorithms.self_calibration.pruning import SegmentTest, squared_distance
+from maplab_py.algorithms.self_calibration.pruning import SegmentEstimate
+from maplab_py.algorithms.self_calibration.reports import PrunedSegment
 from maplab_py.algorithms.self_calibration.segments.database import SegmentDatabase
 from maplab_py.algorithms.self_calibration.segments.selection import collect, evaluate
 from maplab_py.algorithms.self_calibration.uncertainty import larger_covariance
@@ -150,7 +151,7 @@ def test_distances_are_chi_squared_where_the_prior_holds_a_part() -> None:
         tuple(Parameter(f"{k}", "", "imu", "", 0, k, one) for k, one in enumerate(sigma))
     )
     found = [
-        squared_distance(gain @ error, S, S, parameters)
+        SegmentEstimate(parameters, gain @ error, S, S, 1.0).squared_distance()
         for error in rng.multivariate_normal(np.zeros(4), V, 4000, method="cholesky")
     ]
     assert {freedom for _, freedom in found} == {3}  # the prior knows the fourth direction better
@@ -164,7 +165,7 @@ def test_half_of_the_segments_are_no_majority(
     monkeypatch: pytest.MonkeyPatch, against: int, is_refused: bool
 ) -> None:
     # the decision alone: what calibrating and testing give is stated
-    stated = [SegmentTest(1.0, 1.0, 1.0, number < against) for number in range(4)]
+    stated = [PrunedSegment("", "", 1.0, 1.0, 1.0, number < against) for number in range(4)]
     device = SimpleNamespace(sensors=collected().vi_map.sensors)
     monkeypatch.setattr(pruning, "calibrate", lambda *_, **__: (device, None))
     monkeypatch.setattr(pruning, "test_segments", lambda *_: stated)

@@ -17,7 +17,7 @@ from maplab_py.algorithms.self_calibration.estimation.problem import (
 from maplab_py.algorithms.self_calibration.options import SelfCalibrationOptions
 from maplab_py.algorithms.vi_optimization.map_problem import MapProblem
 from maplab_py.algorithms.vi_optimization.solution import apply_states
-from maplab_py.array_types import Mask
+from maplab_py.array_types import Mask, mask_of
 from maplab_py.estimation.problem.solver import (
     AfterStep,
     SolverOptions,
@@ -217,8 +217,7 @@ def reject_tracks_chi2(
     # mean of a chi-square below a limit: n F_{n+2}(limit) / F_n(limit)
     expected = freedom[kept] * chi2.cdf(limit[kept], freedom[kept] + 2.0) / (1.0 - probability)
     factor = float(np.sqrt(np.sum(total[kept]) / np.sum(expected)))
-    is_kept = np.zeros(count, dtype=np.bool_)
-    is_kept[kept] = True
+    is_kept = mask_of(count, kept)
     used = (data.inverse_sigma > 0.0) & is_kept[owner]
     rejection.replace_weights(
         dataclasses.replace(

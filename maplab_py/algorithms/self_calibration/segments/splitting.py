@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from maplab_py.array_types import I64, Mask
+from maplab_py.array_types import I64, Mask, mask_of
 from maplab_py.distinct import distinct
 from maplab_py.vimap import VIMap, descriptors, selection, tables, vertex_removal
 
@@ -40,8 +40,7 @@ def extract_submap(vi_map: VIMap, vertices: I64) -> VIMap:
     Landmarks that two of the vertices observe keep their positions in G. Descriptors, keypoints
     without a landmark, resources and all other edges are dropped.
     """
-    is_kept = np.zeros(len(vi_map.vertices), dtype=np.bool_)
-    is_kept[vertices] = True
+    is_kept = mask_of(len(vi_map.vertices), vertices)
     tracks = _with_tracks_only(vi_map, is_kept)
     moved = np.flatnonzero(~is_kept[tracks.landmarks.vertex])
     store = vertex_removal.stores_for(tracks, moved, is_kept, same_mission=False)
