@@ -226,7 +226,7 @@ def _landmarks(vi_map: VIMap, progress: Progress) -> Iterator[Finding]:
     share = report.bad / max(report.landmarks, 1)
     yield _graded(
         "bad landmarks", share, _BAD_SHARE,
-        f"{100.0 * share:.0f} %, most {quality.causes_in_words(report)[0]}" if report.bad else "none",
+        f"{100.0 * share:.0f} %, most {quality.causes_in_words(vars(report))[0]}" if report.bad else "none",
         f"{100.0 * _BAD_SHARE[0]:.0f} %", "remove_bad_landmarks; why LANDMARK explains one",
     )  # fmt: skip
     keypoints = judged.observations

@@ -83,9 +83,7 @@ def live_map(builder: MapBuilder, landmarks: LiveLandmarks, T_G_M: F64 | None = 
     vi_map = builder.make_map()
     if T_G_M is not None:
         frames, row = vi_map.baseframes, int(vi_map.missions.baseframe[-1])
-        poses = frames.T_G_M.copy()
-        poses[row] = T_G_M
-        vi_map = vi_map.replace(baseframes=frames.replace(T_G_M=poses))
+        vi_map = vi_map.replace(baseframes=frames.put(row, T_G_M=T_G_M))
     p_M = landmarks.p_M
     if not len(p_M):
         return vi_map

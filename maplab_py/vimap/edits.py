@@ -65,9 +65,8 @@ def with_texts_on_newest(vi_map: VIMap, missions: Mask, of: Mask | None = None) 
     rows = rows if of is None else rows[of[vi_map.resources.owner[rows]]]
     if len(rows) == 0 or not missions.any():
         return vi_map
-    owner = vi_map.resources.owner.copy()
-    owner[rows] = newest_mission(vi_map, missions)
-    return vi_map.replace(resources=vi_map.resources.replace(owner=owner))
+    owner = newest_mission(vi_map, missions)
+    return vi_map.replace(resources=vi_map.resources.put(rows, owner=owner))
 
 
 def newest_mission(vi_map: VIMap, missions: Mask) -> int:
@@ -85,9 +84,8 @@ def remove_landmarks(vi_map: VIMap, landmarks: ArrayLike) -> VIMap:
 
 def remove_observations(vi_map: VIMap, keypoints: ArrayLike) -> VIMap:
     """Detach keypoints (rows or a mask (K,)) from their landmarks; the landmarks stay."""
-    landmark = vi_map.keypoints.landmark.copy()
-    landmark[as_rows(keypoints, len(landmark))] = NO_ROW
-    return vi_map.replace(keypoints=vi_map.keypoints.replace(landmark=landmark))
+    rows = as_rows(keypoints, len(vi_map.keypoints))
+    return vi_map.replace(keypoints=vi_map.keypoints.put(rows, landmark=NO_ROW))
 
 
 def remove_loop_closure_edges(vi_map: VIMap, edges: ArrayLike) -> VIMap:
@@ -178,12 +176,11 @@ def add_landmarks(
         quality=np.broadcast_to(np.asarray(quality, dtype=np.int8), (count,)),
         feature_type=np.broadcast_to(np.asarray(feature_type, dtype=np.int32), (count,)),
     )
-    landmark = vi_map.keypoints.landmark.copy()
     new_rows = len(vi_map.landmarks) + np.asarray(keypoint_landmark, dtype=np.int64)
-    landmark[np.asarray(keypoint_rows, dtype=np.int64)] = new_rows
+    observing = np.asarray(keypoint_rows, dtype=np.int64)
     return vi_map.replace(
         landmarks=Landmarks.concatenate([vi_map.landmarks, table]),
-        keypoints=vi_map.keypoints.replace(landmark=landmark),
+        keypoints=vi_map.keypoints.put(observing, landmark=new_rows),
     )
 
 
@@ -191,19 +188,16 @@ def with_p_G(vi_map: VIMap, landmarks: ArrayLike, p_G: ArrayLike) -> VIMap:
     """Set the positions of landmarks (rows (N,)) to points (N, 3) in G; store vertices stay."""
     rows = np.asarray(landmarks, dtype=np.int64)
     T_I_G = se3.inverse(vi_map.T_G_I[vi_map.landmarks.vertex[rows]])
-    p_I = vi_map.landmarks.p_I.copy()
-    p_I[rows] = se3.transform(T_I_G, p_G)
-    return vi_map.replace(landmarks=vi_map.landmarks.replace(p_I=p_I))
+    p_I = se3.transform(T_I_G, p_G)
+    return vi_map.replace(landmarks=vi_map.landmarks.put(rows, p_I=p_I))
 
 
 def transform_mission(vi_map: VIMap, mission: int, T_N_M: F64) -> VIMap:
     """Transform a mission's states to another mission frame N (7,); its pose in G changes."""
     rows = vi_map.vertices.mission == mission
     v = vi_map.vertices
-    T_M_I, v_M = v.T_M_I.copy(), v.v_M.copy()
-    T_M_I[rows] = se3.compose(T_N_M, T_M_I[rows])
-    v_M[rows] = so3.rotate(T_N_M[:4], v_M[rows])
-    return vi_map.replace(vertices=v.replace(T_M_I=T_M_I, v_M=v_M))
+    T_M_I, v_M = se3.compose(T_N_M, v.T_M_I[rows]), so3.rotate(T_N_M[:4], v.v_M[rows])
+    return vi_map.replace(vertices=v.put(rows, T_M_I=T_M_I, v_M=v_M))
 
 
 def with_new_ids(vi_map: VIMap, rng: np.random.Generator | None = None) -> VIMap:

@@ -45,9 +45,8 @@ class Excerpt:
         rows = np.arange(len(self.vertices)) if vertices is None else np.asarray(vertices)
         whole = self._with_observations(self._with_states(edited, rows), edited)
         rows = whole.landmark_index.rows(edited.landmarks.id)
-        quality = whole.landmarks.quality.copy()
-        quality[rows] = edited.landmarks.quality
-        whole = whole.replace(landmarks=whole.landmarks.replace(quality=quality))
+        judged = whole.landmarks.put(rows, quality=edited.landmarks.quality)
+        whole = whole.replace(landmarks=judged)
         moved = self._moved(whole, rows, edited)
         return edits.with_p_G(whole, rows[moved], edited.p_G[moved])
 
@@ -75,11 +74,10 @@ class Excerpt:
             columns[name][self.vertices[changed]] = getattr(v, name)[changed]
         rows = self.source.missions.baseframe[self.missions]
         frames, of = self.source.baseframes, edited.missions.baseframe
-        T_G_M, is_known = frames.T_G_M.copy(), frames.is_known.copy()
-        T_G_M[rows], is_known[rows] = edited.baseframes.T_G_M[of], edited.baseframes.is_known[of]
+        now = edited.baseframes.take(of)
         return self.source.replace(
             vertices=whole.replace(**columns),
-            baseframes=frames.replace(T_G_M=T_G_M, is_known=is_known),
+            baseframes=frames.put(rows, T_G_M=now.T_G_M, is_known=now.is_known),
         )
 
     def _with_observations(self, whole: VIMap, edited: VIMap) -> VIMap:
@@ -93,9 +91,8 @@ class Excerpt:
         source, target = _most_frequent(before[moved], after[moved])
         merged = edits.merge_landmarks(whole, self.landmarks[source], self.landmarks[target])
         rows = merged.landmark_index.rows(self.source.landmarks.id[self.landmarks])
-        landmark = merged.keypoints.landmark.copy()
-        landmark[self.keypoints] = np.append(rows, tables.NO_ROW)[after]
-        merged = merged.replace(keypoints=merged.keypoints.replace(landmark=landmark))
+        landmark = np.append(rows, tables.NO_ROW)[after]
+        merged = merged.replace(keypoints=merged.keypoints.put(self.keypoints, landmark=landmark))
         absent = rows[~is_kept[:-1]]
         absent = absent[absent >= 0]
         return edits.remove_landmarks(

@@ -79,6 +79,13 @@ class Table:
         """Return a table with some columns exchanged and all others shared."""
         return dataclasses.replace(self, **columns)
 
+    def put(self, rows: Any, **values: ArrayLike) -> Self:
+        """Return a table with other values of some columns in some rows (indices or a boolean mask)."""
+        columns = {name: np.array(getattr(self, name)) for name in values}
+        for name, value in values.items():
+            columns[name][rows] = value
+        return self.replace(**columns)
+
     def take(self, rows: ArrayLike) -> Self:
         """Return the table of the given rows (indices or a boolean mask)."""
         index = np.asarray(rows)

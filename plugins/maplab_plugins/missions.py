@@ -205,9 +205,8 @@ def _set_all(context: CommandContext, *, is_known: bool) -> Message:
 
 def _mark(context: CommandContext, rows: int | slice, frames: str, *, is_known: bool) -> Message:
     vi_map = context.vi_map
-    known = vi_map.baseframes.is_known.copy()
-    known[vi_map.missions.baseframe[rows]] = is_known
-    context.commit(vi_map.replace(baseframes=vi_map.baseframes.replace(is_known=known)))
+    known = vi_map.baseframes.put(vi_map.missions.baseframe[rows], is_known=is_known)
+    context.commit(vi_map.replace(baseframes=known))
     return Message(f"base {frames} set to {'known' if is_known else 'unknown'}")
 
 

@@ -117,7 +117,7 @@ def anchor_missions(
     )
     if not anchored.any():
         return vi_map, report
-    result = _with_base_frames(vi_map, T_G_M, anchored)
+    result = _with_base_frames(vi_map, anchored, T_G_M[anchored])
     return record_updates.with_closures(result, detection.closures, "anchor"), report
 
 
@@ -259,11 +259,9 @@ def _why_not(  # type: ignore[no-untyped-def]
     return report.reason or "no verified closure with any other mission"
 
 
-def _with_base_frames(vi_map: VIMap, T_G_M: F64, anchored: NDArray[np.bool_]) -> VIMap:
-    rows = vi_map.missions.baseframe[anchored]
-    poses, is_known = vi_map.baseframes.T_G_M.copy(), vi_map.baseframes.is_known.copy()
-    poses[rows], is_known[rows] = yaw.to_pose(T_G_M[anchored]), True
-    return vi_map.replace(baseframes=vi_map.baseframes.replace(T_G_M=poses, is_known=is_known))
+def _with_base_frames(vi_map: VIMap, missions: NDArray[np.bool_] | int, T_G_M: F64) -> VIMap:
+    rows, poses = vi_map.missions.baseframe[missions], yaw.to_pose(T_G_M)
+    return vi_map.replace(baseframes=vi_map.baseframes.put(rows, T_G_M=poses, is_known=True))
 
 
 def described_hypotheses(
@@ -317,9 +315,6 @@ def place_mission(vi_map: VIMap, mission: int, T_G_M: F64) -> tuple[VIMap, Ancho
     """
     known = vi_map.baseframes.is_known[vi_map.missions.baseframe]
     _require_unknown(vi_map, mission)
-    row = vi_map.missions.baseframe[mission]
-    poses, is_known = vi_map.baseframes.T_G_M.copy(), vi_map.baseframes.is_known.copy()
-    poses[row], is_known[row] = yaw.to_pose(T_G_M), True
     names = [to_hex(words)[:8] for words in vi_map.missions.id]
     report = AnchoringReport(
         already_known=tuple(names[i] for i in np.flatnonzero(known)),
@@ -328,8 +323,7 @@ def place_mission(vi_map: VIMap, mission: int, T_G_M: F64) -> tuple[VIMap, Ancho
         alignments=(),
         notes=("the base frame was given and not compared with closures",),
     )
-    frames = vi_map.baseframes.replace(T_G_M=poses, is_known=is_known)
-    return vi_map.replace(baseframes=frames), report
+    return _with_base_frames(vi_map, mission, T_G_M), report
 
 
 def choice_near(vi_map: VIMap, mission: int, to: int, T_G_M: F64) -> ambiguity.AlignmentChoice:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import reduce
+from typing import Any
 
 import numpy as np
 
@@ -204,6 +205,14 @@ def _first_copies(ids: IdArray) -> I64:
     return np.where(is_valid(ids), first[inverse], np.arange(len(ids)))
 
 
+def _best_of(first: I64, *keys: NDArray[Any]) -> I64:
+    """Return the best copy (N,) of rows given by their first copies: the least in the last key first."""
+    order = np.lexsort((*keys, first))
+    best = np.empty(len(first), dtype=np.int64)
+    best[first[order[::-1]]] = order[::-1]
+    return best[first]
+
+
 def _with_common_base_frames(stacked: VIMap) -> tuple[VIMap, I64]:
     """Express all copies of a mission in the base frame of the first; return its row for each (M,)."""
     mission = _first_copies(stacked.missions.id)
@@ -214,12 +223,11 @@ def _with_common_base_frames(stacked: VIMap) -> tuple[VIMap, I64]:
         return stacked, mission
     of_row = stacked.vertices.mission[rows]
     T_N_M = se3.relative(T_G_M[mission[of_row]], T_G_M[of_row])
-    T_M_I, v_M = stacked.vertices.T_M_I.copy(), stacked.vertices.v_M.copy()
-    T_M_I[rows] = se3.compose(T_N_M, T_M_I[rows])
-    v_M[rows] = so3.rotate(T_N_M[:, :4], v_M[rows])
+    T_M_I = se3.compose(T_N_M, stacked.vertices.T_M_I[rows])
+    v_M = so3.rotate(T_N_M[:, :4], stacked.vertices.v_M[rows])
     baseframe = stacked.missions.baseframe[mission]
     return stacked.replace(
-        vertices=stacked.vertices.replace(T_M_I=T_M_I, v_M=v_M),
+        vertices=stacked.vertices.put(rows, T_M_I=T_M_I, v_M=v_M),
         missions=stacked.missions.replace(baseframe=baseframe),
     ), mission
 
@@ -232,12 +240,7 @@ def _deepest_copies(stacked: VIMap, cell: I64, cells: int) -> I64:
         inside = np.flatnonzero(cell == number)
         lacking = np.setdiff1d(first, first[inside])
         depth_m[inside] = _distances_m(stacked.T_G_I[inside, 4:], stacked.T_G_I[lacking, 4:])
-    order = np.lexsort((cell, -depth_m, first))
-    is_best = np.ones(len(order), dtype=np.bool_)
-    is_best[1:] = first[order][1:] != first[order][:-1]
-    best = np.empty(len(first), dtype=np.int64)
-    best[first[order][is_best]] = order[is_best]
-    return best[first]
+    return _best_of(first, cell, -depth_m)
 
 
 def _distances_m(p: F64, others: F64) -> F64:
@@ -333,12 +336,8 @@ def _stores(stacked: VIMap, taken: I64) -> tuple[I64, I64]:
     landmarks, vertices = stacked.landmarks, stacked.vertices
     first = _first_copies(landmarks.id)
     at = landmarks.vertex
-    order = np.lexsort((np.arange(len(at)), taken[at] != at, vertices.timestamp_ns[at], first))
-    is_best = np.ones(len(order), dtype=np.bool_)
-    is_best[1:] = first[order][1:] != first[order][:-1]
-    best = np.empty(len(first), dtype=np.int64)
-    best[first[order][is_best]] = order[is_best]
-    return best[first], taken[at]
+    best = _best_of(first, np.arange(len(at)), taken[at] != at, vertices.timestamp_ns[at])
+    return best, taken[at]
 
 
 def _unite_landmarks(
@@ -380,10 +379,7 @@ def _shortest(ids: IdArray, from_vertex: I32, to_vertex: I32) -> I64:
     """Return the rows of the edges that span fewest vertices of those with one id, in row order."""
     first = _first_copies(ids)
     span = np.abs(to_vertex.astype(np.int64) - from_vertex)
-    order = np.lexsort((np.arange(len(first)), span, first))
-    is_best = np.ones(len(order), dtype=np.bool_)
-    is_best[1:] = first[order][1:] != first[order][:-1]
-    return np.sort(order[is_best])
+    return np.unique(_best_of(first, np.arange(len(first)), span))
 
 
 def _first_rows(keys: IdArray) -> I64:

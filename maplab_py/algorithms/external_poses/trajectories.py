@@ -405,15 +405,13 @@ def with_sensor(
     if base and base == mission_sensor_id(vi_map, mission, MissionSensor.IMU):
         T_B_S = np.asarray(T_I_S)
     mounts = {**sensors.extrinsics, sensor_id: Extrinsics(base or sensor_id, T_B_S)}
-    ids = np.array(vi_map.missions.sensor_id)
-    ids[mission, kind] = from_hex(sensor_id)
     return vi_map.replace(
         sensors=type(sensors)(
             {**sensors.sensors, sensor_id: OtherSensor(sensor_id, name, entry)},
             mounts,
             sensors.extra,
         ),
-        missions=vi_map.missions.replace(sensor_id=ids),
+        missions=vi_map.missions.put((mission, kind), sensor_id=from_hex(sensor_id)),
     )
 
 

@@ -128,11 +128,10 @@ def _with_given_sensor(
         MapError: The covariance in sensors.yaml is no matrix.
     """
     words = from_hex(sensor.id)
-    ids = np.array(vi_map.missions.sensor_id)
-    ids[mission, MissionSensor.WHEEL_ODOMETRY] = words
+    missions = vi_map.missions.put((mission, MissionSensor.WHEEL_ODOMETRY), sensor_id=words)
     entry = yaml_entry.Entry(sensor.keys, f"sensors.yaml: sensor {sensor.id}")
     covariance = entry.matrix(_COVARIANCE, 6, 6) if _COVARIANCE in entry else None
-    return vi_map.replace(missions=vi_map.missions.replace(sensor_id=ids)), words, covariance
+    return vi_map.replace(missions=missions), words, covariance
 
 
 def _covariances(T_A_B: F64, options: WheelOptions, *, is_planar: bool) -> F64:

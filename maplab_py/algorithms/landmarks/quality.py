@@ -1,6 +1,8 @@
 """Landmark quality: tests whether landmarks are well constrained by the geometry of their rays."""
 
 import dataclasses
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -57,13 +59,12 @@ def _judge(
 ) -> tuple[VIMap, dict[str, int]]:
     """Return the map with the quality of some landmarks, and how many of them fail each criterion."""
     gates = criteria(vi_map, rows, options)
-    quality = vi_map.landmarks.quality.copy()
-    quality[rows] = np.where(any_failed(gates), LandmarkQuality.BAD, LandmarkQuality.GOOD)
+    quality = np.where(any_failed(gates), LandmarkQuality.BAD, LandmarkQuality.GOOD)
     counts = {
         name: int(any_failed([gate for gate in gates if gate.verdict == name]).sum())
         for name in _REASONS
     }
-    return vi_map.replace(landmarks=vi_map.landmarks.replace(quality=quality)), counts
+    return vi_map.replace(landmarks=vi_map.landmarks.put(rows, quality=quality)), counts
 
 
 def reset_quality(
@@ -72,11 +73,9 @@ def reset_quality(
     """Set the quality of every landmark stored in the missions to unknown."""
     progress.check()
     rows = np.flatnonzero(queries.landmark_mask(vi_map, missions))
-    quality = vi_map.landmarks.quality.copy()
-    before = quality[rows]
-    quality[rows] = LandmarkQuality.UNKNOWN
-    report = _report(before, quality[rows], {})
-    return vi_map.replace(landmarks=vi_map.landmarks.replace(quality=quality)), report
+    reset = vi_map.landmarks.put(rows, quality=LandmarkQuality.UNKNOWN)
+    report = _report(vi_map.landmarks.quality[rows], reset.quality[rows], {})
+    return vi_map.replace(landmarks=reset), report
 
 
 def criteria(vi_map: VIMap, landmarks: I64, options: LandmarkQualityOptions) -> list[Gate]:
@@ -219,15 +218,14 @@ def mostly_bad(bad: int, landmarks: int, reasons: dict[str, int]) -> str:
     """
     if 2 * bad <= landmarks:
         return ""
-    causes = sorted(((count, name) for name, count in reasons.items() if count), reverse=True)
-    listed = ", ".join(f"{count} {_REASONS[name]}" for count, name in causes)
+    listed = ", ".join(causes_in_words(reasons))
     return f"{bad} of {landmarks} landmarks are bad" + (f": {listed}" if listed else "")
 
 
-def causes_in_words(report: LandmarkQualityReport) -> list[str]:
-    """Return the criteria that bad landmarks fail, with their numbers, the most frequent first."""
-    counts = sorted(((getattr(report, name), name) for name in _REASONS), reverse=True)
-    return [f"{count} {_REASONS[name]}" for count, name in counts if count]
+def causes_in_words(counts: Mapping[str, Any]) -> list[str]:
+    """Return the criteria that bad landmarks fail, with their numbers by name, the most frequent first."""
+    causes = sorted(((counts[name], name) for name in _REASONS if counts.get(name)), reverse=True)
+    return [f"{count} {_REASONS[name]}" for count, name in causes]
 
 
 def evaluate_unknown_quality(

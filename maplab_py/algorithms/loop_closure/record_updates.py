@@ -288,10 +288,9 @@ def _as_before(vi_map: VIMap, recorded: MergedLandmarks, rows: I64, vertex: I64)
     p_G = se3.transform(vi_map.T_G_I[vertex], recorded.p_I[rows])
     moved = edits.with_p_G(vi_map, landmarks, p_G)
     stored_there = moved.landmarks.vertex[landmarks] == vertex
-    p_I, quality = np.array(moved.landmarks.p_I), np.array(moved.landmarks.quality)
-    p_I[landmarks[stored_there]] = recorded.p_I[rows[stored_there]]
-    quality[landmarks] = recorded.quality[rows]
-    return moved.replace(landmarks=moved.landmarks.replace(p_I=p_I, quality=quality))
+    p_I = recorded.p_I[rows[stored_there]]
+    table = moved.landmarks.put(landmarks[stored_there], p_I=p_I)
+    return moved.replace(landmarks=table.put(landmarks, quality=recorded.quality[rows]))
 
 
 def _first_of_each(landmarks: MergedLandmarks) -> MergedLandmarks:

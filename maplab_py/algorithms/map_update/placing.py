@@ -129,6 +129,5 @@ def _with_observations(vi_map: VIMap, keypoint: I64, landmark: I64) -> VIMap:
     wanted = vi_map.keypoint_frame[keypoint].astype(np.int64) * count + landmark
     _, first = np.unique(wanted, return_index=True)
     first = first[~np.isin(wanted[first], key)]
-    column = vi_map.keypoints.landmark.copy()
-    column[keypoint[first]] = landmark[first]
-    return vi_map.replace(keypoints=vi_map.keypoints.replace(landmark=column))
+    keypoints = vi_map.keypoints.put(keypoint[first], landmark=landmark[first])
+    return vi_map.replace(keypoints=keypoints)

@@ -235,9 +235,9 @@ def changes_since(
 
 def at_places_of(whole: VIMap, session: VIMap) -> VIMap:
     """Return a session with the base frames that its missions, the last of a map, have there."""
-    T_G_M = session.baseframes.T_G_M.copy()
-    T_G_M[session.missions.baseframe] = whole.T_G_M[-len(session.missions) :]
-    return session.replace(baseframes=session.baseframes.replace(T_G_M=T_G_M))
+    T_G_M = whole.T_G_M[-len(session.missions) :]
+    frames = session.baseframes.put(session.missions.baseframe, T_G_M=T_G_M)
+    return session.replace(baseframes=frames)
 
 
 def _with_names(report: ChangeReport, name: dict[str, str]) -> ChangeReport:
@@ -264,10 +264,8 @@ def _check_anchored(vi_map: VIMap) -> None:
 def _at_place(session: VIMap, placed: placing.Placed) -> VIMap:
     """Return a session with the base frames of placed missions known, all others unknown."""
     rows = session.missions.baseframe[placed.missions]
-    T_G_M = session.baseframes.T_G_M.copy()
-    is_known = np.zeros(len(session.baseframes), dtype=np.bool_)
-    T_G_M[rows], is_known[rows] = placed.T_G_M, True
-    return session.replace(baseframes=session.baseframes.replace(T_G_M=T_G_M, is_known=is_known))
+    frames = session.baseframes.put(slice(None), is_known=False)
+    return session.replace(baseframes=frames.put(rows, T_G_M=placed.T_G_M, is_known=True))
 
 
 def _anchored(

@@ -51,9 +51,8 @@ def assign_covariance(
     mine = edges.kind == _KINDS[edge_type]
     if not mine.any():
         raise UserError(f"the map has no edge of type {edge_type.value}")
-    changed = edges.covariance.copy()
-    changed[mine] = np.diag(sigma**2)
-    result = vi_map.replace(transformation_edges=edges.replace(covariance=changed))
+    edges = edges.put(mine, covariance=np.diag(sigma**2))
+    result = vi_map.replace(transformation_edges=edges)
     return result, int(mine.sum())
 
 

@@ -30,7 +30,6 @@ def distribute_missions(vi_map: VIMap, options: LayoutOptions) -> tuple[VIMap, i
     rows = vi_map.missions.baseframe[~frames.is_known[vi_map.missions.baseframe]]
     if len(rows) == 0:
         return vi_map, 0
-    T_G_M = frames.T_G_M.copy()
     number = np.arange(len(rows))
     place = np.zeros((len(rows), 3))
     if options.around_circle:
@@ -39,8 +38,8 @@ def distribute_missions(vi_map: VIMap, options: LayoutOptions) -> tuple[VIMap, i
         place[:, 1] = options.meters * np.sin(angle)
     else:
         place[:, options.dimension] = options.meters * (number + 1)
-    T_G_M[rows, 4:] = place
-    return vi_map.replace(baseframes=frames.replace(T_G_M=T_G_M)), len(rows)
+    moved = frames.put((rows, slice(4, None)), T_G_M=place)
+    return vi_map.replace(baseframes=moved), len(rows)
 
 
 class DisturbanceOptions(Options, prefix="disturb_"):

@@ -163,9 +163,8 @@ def _with_switches(vi_map: VIMap, closures: LoopClosureEdges, weight: F64) -> VI
     if len(edges) == 0:
         return vi_map
     row = IdIndex(edges.id).rows(closures.id)
-    switch = edges.switch_variable.copy()
-    switch[row[row >= 0]] = np.sqrt(weight[row >= 0])
-    return vi_map.replace(loop_closure_edges=edges.replace(switch_variable=switch))
+    edges = edges.put(row[row >= 0], switch_variable=np.sqrt(weight[row >= 0]))
+    return vi_map.replace(loop_closure_edges=edges)
 
 
 def move_vertices(vi_map: VIMap, rows: I64, T_G_I: F64) -> VIMap:
@@ -177,10 +176,8 @@ def move_vertices(vi_map: VIMap, rows: I64, T_G_I: F64) -> VIMap:
     T_G_M = vi_map.T_G_M[vertices.mission[rows]]
     T_M_I = se3.relative(T_G_M, T_G_I[rows])
     turn_M = so3.multiply(T_M_I[:, :4], so3.inverse(vertices.T_M_I[rows, :4]))
-    poses, velocities = vertices.T_M_I.copy(), vertices.v_M.copy()
-    poses[rows] = T_M_I
-    velocities[rows] = so3.rotate(turn_M, vertices.v_M[rows])
-    return vi_map.replace(vertices=vertices.replace(T_M_I=poses, v_M=velocities))
+    v_M = so3.rotate(turn_M, vertices.v_M[rows])
+    return vi_map.replace(vertices=vertices.put(rows, T_M_I=T_M_I, v_M=v_M))
 
 
 def _anchors(label: I64, is_active: Mask) -> I64:

@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from maplab_py.algorithms.anchoring.anchoring import anchor_missions
 from maplab_py.algorithms.anchoring.options import AnchoringOptions
@@ -101,10 +100,9 @@ def _optimize(vi_map: VIMap, iterations: int, progress: Progress) -> tuple[VIMap
 
 def _anchored(vi_map: VIMap, loops: LoopClosureOptions, progress: Progress) -> tuple[VIMap, Report]:
     frames = vi_map.baseframes
-    known: NDArray[np.bool_] = frames.is_known.copy()
-    if not known[vi_map.missions.baseframe].any():
-        known[vi_map.missions.baseframe[0]] = True
-        vi_map = vi_map.replace(baseframes=frames.replace(is_known=known))
+    if not frames.is_known[vi_map.missions.baseframe].any():
+        first = vi_map.missions.baseframe[0]
+        vi_map = vi_map.replace(baseframes=frames.put(first, is_known=True))
     result, report = anchor_missions(vi_map, AnchoringOptions(), loops, progress=progress)
     if report.not_anchored:
         raise EstimationError(f"{report.failure}; remove what does not belong to this map")

@@ -23,10 +23,9 @@ def apply_states(map_problem: MapProblem, states: States, options: FixedStates) 
         vi_map = _with_base_frames(vi_map, map_problem, states)
     vi_map = _with_vertices(vi_map, map_problem, states)
     if pose.SWITCH in states.blocks:
-        edges = vi_map.loop_closure_edges
-        switch = np.array(edges.switch_variable)
-        switch[map_problem.factors.switched_edges] = states.blocks[pose.SWITCH].values[:, 0]
-        vi_map = vi_map.replace(loop_closure_edges=edges.replace(switch_variable=switch))
+        switch, rows = states.blocks[pose.SWITCH].values[:, 0], map_problem.factors.switched_edges
+        edges = vi_map.loop_closure_edges.put(rows, switch_variable=switch)
+        vi_map = vi_map.replace(loop_closure_edges=edges)
     vi_map = _with_landmarks(vi_map, map_problem, states)
     return _with_landmarks_kept(map_problem, vi_map) if options.fix_landmark_positions else vi_map
 
@@ -67,28 +66,27 @@ def _with_base_frames(vi_map: VIMap, map_problem: MapProblem, states: States) ->
 def _with_vertices(vi_map: VIMap, map_problem: MapProblem, states: States) -> VIMap:
     rows = map_problem.selection.vertices
     T_G_M = vi_map.T_G_M[vi_map.vertices.mission[rows]]
-    columns = {
-        name: np.array(getattr(vi_map.vertices, name))
-        for name in ("T_M_I", "v_M", "gyro_bias", "accel_bias")
-    }
-    columns["T_M_I"][rows] = se3.relative(T_G_M, states.T_G_I)
-    columns["v_M"][rows] = so3.rotate(so3.inverse(T_G_M[:, :4]), states.v_G)
-    columns["gyro_bias"][rows] = states.gyro_bias
-    columns["accel_bias"][rows] = states.accel_bias
-    return vi_map.replace(vertices=vi_map.vertices.replace(**columns))
+    vertices = vi_map.vertices.put(
+        rows,
+        T_M_I=se3.relative(T_G_M, states.T_G_I),
+        v_M=so3.rotate(so3.inverse(T_G_M[:, :4]), states.v_G),
+        gyro_bias=states.gyro_bias,
+        accel_bias=states.accel_bias,
+    )
+    return vi_map.replace(vertices=vertices)
 
 
 def _with_landmarks(vi_map: VIMap, map_problem: MapProblem, states: States) -> VIMap:
     selection, rejection = map_problem.selection, map_problem.rejection
     if rejection is None:
         return vi_map
-    p_I, quality = np.array(vi_map.landmarks.p_I), np.array(vi_map.landmarks.quality)
     alive = rejection.used_landmarks()
     landmarks = selection.landmarks[alive]
     home = selection.rows(vi_map.landmarks.vertex[landmarks])
-    p_I[landmarks] = se3.transform(se3.inverse(states.T_G_I[home]), states.p_G[alive])
-    quality[selection.landmarks[~alive]] = LandmarkQuality.BAD
-    return vi_map.replace(landmarks=vi_map.landmarks.replace(p_I=p_I, quality=quality))
+    p_I = se3.transform(se3.inverse(states.T_G_I[home]), states.p_G[alive])
+    table = vi_map.landmarks.put(landmarks, p_I=p_I)
+    bad = selection.landmarks[~alive]
+    return vi_map.replace(landmarks=table.put(bad, quality=LandmarkQuality.BAD))
 
 
 def _with_landmarks_kept(map_problem: MapProblem, vi_map: VIMap) -> VIMap:
