@@ -42,8 +42,8 @@ def import_colmap(
     options = options or ColmapImportOptions()
     if options.align_to and (options.scale or options.gravity):
         raise UserError("--align_to gives scale and gravity: leave --scale and --gravity out")
-    model, differing = with_poses(reading.read_model(folder), options.colmap_poses)
-    notes, recorded_uv = [differing] if differing else [], model.images.uv
+    model, notes = with_poses(reading.read_model(folder), options.colmap_poses)
+    recorded_uv = model.images.uv
     if options.undistort and not all(has_model(camera) for camera in model.cameras):
         if options.images:
             raise UserError(
@@ -52,12 +52,17 @@ def import_colmap(
             )
         model = undistortion.perspective_model(model, folder)
     side = SideFile.read(folder)
-    times_ns = _times(model, side, options)
-    bodies = to_map.body_frames(model, times_ns, side)
+    row_of = {name: row for row, name in enumerate(side.image_name.tolist())}
+    known = np.array([row_of.get(name, -1) for name in model.images.name], dtype=np.int64)
+    stamped = known if options.timestamps_from == "name" else np.full_like(known, -1)
+    times_ns, new = picked(side.image_time_ns, stamped, np.zeros_like(known)), stamped < 0
+    times_ns[new] = image_times(tuple(np.array(model.images.name)[new].tolist()), options)
+    bodies = to_map.body_frames(model, times_ns, side, known)
     placing = _place(model, bodies, options)
     is_metric = np.full(len(bodies.mission_rig), placing.is_metric, dtype=np.bool_)
     if not options.scale and not options.gravity:
         is_metric |= picked(side.is_metric != 0, bodies.mission_row, np.zeros_like(is_metric))
+    edge_sigma = options.colmap_odometry_sigma_m, np.deg2rad(options.colmap_odometry_sigma_deg)
     imported = to_map.map_of_model(
         model,
         bodies,
@@ -67,9 +72,7 @@ def import_colmap(
         scale=placing.scale,
         is_metric=is_metric,
         sigma_px=options.colmap_keypoint_sigma_px,
-        edge_sigma=np.repeat(
-            [options.colmap_odometry_sigma_m, np.deg2rad(options.colmap_odometry_sigma_deg)], 3
-        ),
+        edge_sigma=np.repeat(edge_sigma, 3),
     )
     vi_map, attached = imported.vi_map, 0
     names = [model.images.name[row] for row in imported.images.tolist()]
@@ -102,17 +105,6 @@ def import_colmap(
         alignment_rmse_m=placing.rmse_m if placing.matched else None,
         notes=tuple(notes),
     )
-
-
-def _times(model: ColmapModel, side: SideFile, options: ColmapImportOptions) -> I64:
-    """Return the times (N,) of images; the side file has those of its images."""
-    known = np.full(len(model.images.id), -1, dtype=np.int64)
-    if options.timestamps_from == "name":
-        known = to_map.side_images(model, side)
-    times_ns = picked(side.image_time_ns, known, np.zeros(len(known), dtype=np.int64))
-    new = np.flatnonzero(known < 0)
-    times_ns[new] = image_times(tuple(model.images.name[row] for row in new.tolist()), options)
-    return times_ns
 
 
 def _place(model: ColmapModel, bodies: to_map.BodyFrames, options: ColmapImportOptions) -> Placing:
@@ -160,7 +152,15 @@ def image_times(names: tuple[str, ...], options: ColmapImportOptions) -> I64:
         if missing:
             raise UserError(f"{file}: has no time stamp of image {missing[0]}: add a line for it")
         return np.array([times[name] for name in names], dtype=np.int64)
-    tokens = [_stamp_of_name(name) for name in names]
+    tokens = []
+    for name in names:
+        numbers = _NUMBER.findall(PurePosixPath(name).stem) or [""]
+        tokens.append(numbers[-1])
+        if "." not in tokens[-1] and not _FEWEST_DIGITS <= len(tokens[-1]) < 20:
+            raise UserError(
+                f"image {name}: its name has no time stamp: give --timestamps_from=order, or =file with "
+                "--timestamps_file"
+            )
     return _times_ns(names, tokens, "names of images", None, options.time_unit)
 
 
@@ -216,17 +216,6 @@ def _times_ns(
     return parse_stamps(tokens, IMAGES, source, lines, unit=time_unit).times_ns
 
 
-def _stamp_of_name(name: str) -> str:
-    numbers = _NUMBER.findall(PurePosixPath(name).stem)
-    text = numbers[-1] if numbers else ""
-    if "." in text or _FEWEST_DIGITS <= len(text) < 20:
-        return text
-    raise UserError(
-        f"image {name}: its name has no time stamp: give --timestamps_from=order, or =file with "
-        "--timestamps_file"
-    )
-
-
 _SAME_RAD, _SAME_SHARE = 2e-4, 1e-4
 """Differences between poses that rounded text makes; of positions: share of their spread."""
 _LONGEST_GAP_NS = 500_000_000
@@ -246,8 +235,8 @@ class Placing:
     rmse_m: float = float("nan")  # of their positions after the alignment
 
 
-def with_poses(model: ColmapModel, choice: str = "") -> tuple[ColmapModel, str]:
-    """Return the model with the poses of frames that hold, and a clause on what differs.
+def with_poses(model: ColmapModel, choice: str = "") -> tuple[ColmapModel, list[str]]:
+    """Return the model with the poses of frames that hold, and notes on what differs.
 
     Args:
         model: Model, whose images and whose frames with their rigs both have poses.
@@ -264,13 +253,13 @@ def with_poses(model: ColmapModel, choice: str = "") -> tuple[ColmapModel, str]:
     spread = float(np.sqrt(np.sum(np.var(frames.T_R_W[:, 4:], axis=0))))
     differs = (turned > _SAME_RAD) | (moved > _SAME_SHARE * max(spread, 1.0))
     if not differs.any():
-        return model, ""
+        return model, []
     said = (
         f"the poses of {counted(int(differs.sum()), 'image')} differ from those of rigs and frames by up to "
         f"{np.degrees(turned[differs].max()):.3g} deg and {moved[differs].max():.3g} units"
     )
     if choice == "frames":
-        return model, f"{said}: those of the frames are taken"
+        return model, [f"{said}: those of the frames are taken"]
     known = np.isfinite(T_R_W).all(axis=1) & (differs | (choice == "images"))
     rows = np.flatnonzero(known)
     rows = rows[np.lexsort((place[rows], frame[rows]))]
@@ -280,7 +269,7 @@ def with_poses(model: ColmapModel, choice: str = "") -> tuple[ColmapModel, str]:
     said += ": those of the images are taken"
     if not choice:
         said += ", --colmap_poses=frames takes the others"
-    return dataclasses.replace(model, frames=dataclasses.replace(frames, T_R_W=poses)), said
+    return dataclasses.replace(model, frames=dataclasses.replace(frames, T_R_W=poses)), [said]
 
 
 def _place_by_trajectory(bodies: to_map.BodyFrames, trajectory: Trajectory) -> Placing:

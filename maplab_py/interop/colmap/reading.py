@@ -10,7 +10,7 @@ from maplab_py.array_types import F64, I64, Mask
 from maplab_py.errors import MapError, UserError
 from maplab_py.geometry import se3
 from maplab_py.interop.colmap import model as colmap
-from maplab_py.interop.colmap.records import ANNOUNCED, REMEDY, Records, records_of
+from maplab_py.interop.colmap.records import ANNOUNCED, FILES_OF, REMEDY, Records
 from maplab_py.sensors import Camera
 
 _HEADER_BYTES = 4096
@@ -81,14 +81,15 @@ def _read_files(folder: Path, suffix: str) -> colmap.ColmapModel:
 
     Models of versions without rigs and frames get a rig of each camera, and a frame of each image.
     """
-    cameras = _cameras(records_of(folder / f"cameras{suffix}"))
-    images = _images(records_of(folder / f"images{suffix}"))
-    points = _points(records_of(folder / f"points3D{suffix}"))
+    opened = FILES_OF[suffix]
+    cameras = _cameras(opened(folder / f"cameras{suffix}"))
+    images = _images(opened(folder / f"images{suffix}"))
+    points = _points(opened(folder / f"points3D{suffix}"))
     rigs_file, frames_file = (folder / f"{kind}{suffix}" for kind in ("rigs", "frames"))
     if rigs_file.exists() or frames_file.exists():
         rigs, (frames, owner, image) = (
-            _rigs(records_of(rigs_file)),
-            _frames(records_of(frames_file)),
+            _rigs(opened(rigs_file)),
+            _frames(opened(frames_file)),
         )
     else:
         used = np.unique(images.camera).tolist()
@@ -157,6 +158,8 @@ def _cameras(file: Records) -> tuple[colmap.ColmapCamera, ...]:
         model, (width, height) = colmap.MODELS[kind], file.integers("QQ")
         file.wanted = f"{model.name} with {model.parameters} parameters"
         parameters = file.doubles(model.parameters)
+        if not np.isfinite(parameters).all():
+            raise file.damaged("it has numbers that are not finite")
         if not (0 < width < 1 << 31 and 0 < height < 1 << 31):
             raise file.damaged(f"the images of camera {number} have no pixels")
         cameras.append(colmap.ColmapCamera(number, kind, width, height, parameters))
@@ -274,7 +277,7 @@ def read_cameras(path: Path) -> tuple[list[Camera], F64]:
         model = read_model(path)
         cameras, T_R_C = _rig(model, path)
     else:
-        cameras = _cameras(records_of(path))
+        cameras = _cameras(FILES_OF[path.suffix](path))
         T_R_C = np.atleast_2d(se3.identity())
         if len(cameras) != 1:
             raise UserError(

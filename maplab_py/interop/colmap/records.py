@@ -45,16 +45,11 @@ class _File:
     def __init__(self, path: Path) -> None:
         self.path, self._line = path, ""
 
-    def doubles(self, count: int) -> F64:
-        """Take numbers that are finite."""
-        values = self._doubles(count)
-        if not np.all(np.isfinite(values)):
-            raise self.damaged("it has numbers that are not finite")
-        return values
-
     def pose(self) -> F64:
         """Take a pose (7,), which has w first in files."""
         values = self.doubles(7)[[1, 2, 3, 0, 4, 5, 6]]
+        if not np.isfinite(values).all():
+            raise self.damaged("it has numbers that are not finite")
         size = float(np.abs(values[:4]).max())
         if not _SIZES[0] < size < _SIZES[1] or (
             abs(float(np.linalg.norm(values[:4])) - 1.0) > self.tolerance
@@ -66,7 +61,8 @@ class _File:
         """Return the error that the file is damaged."""
         return MapError(f"{self.path}{self._line}: is damaged: {reason}; {REMEDY}")
 
-    def _doubles(self, count: int) -> F64:
+    def doubles(self, count: int) -> F64:
+        """Take numbers."""
         raise NotImplementedError
 
 
@@ -83,7 +79,10 @@ class _Binary(_File):
 
     def records(self, least_bytes: int) -> Iterator[None]:
         """Yield at the beginning of each record, which has at least so many bytes."""
-        for _ in range(self._count(least_bytes)):
+        (count,) = self.integers("Q")
+        if count * least_bytes > len(self._data) - self._at:
+            raise self.damaged("it ends too early")
+        for _ in range(count):
             yield
         if self._at != len(self._data):
             raise self.damaged(f"{len(self._data) - self._at} bytes follow its last record")
@@ -109,8 +108,7 @@ class _Binary(_File):
 
     def keypoints(self) -> NDArray[Any]:
         """Take the keypoints of an image."""
-        size = KEYPOINT.itemsize
-        return np.frombuffer(self._take(size * self._count(size)), dtype=KEYPOINT)
+        return np.frombuffer(self._take(KEYPOINT.itemsize * self.integers("Q")[0]), dtype=KEYPOINT)
 
     def points(self) -> NDArray[Any]:
         """Take all points."""
@@ -126,13 +124,8 @@ class _Binary(_File):
         self._at += size
         return self._data[self._at - size : self._at]
 
-    def _count(self, least_bytes: int) -> int:
-        (count,) = self.integers("Q")
-        if count * least_bytes > len(self._data) - self._at:
-            raise self.damaged("it ends too early")
-        return count
-
-    def _doubles(self, count: int) -> F64:
+    def doubles(self, count: int) -> F64:
+        """See `_File`."""
         return np.frombuffer(self._take(8 * count), dtype="<f8").astype(np.float64)
 
 
@@ -196,12 +189,15 @@ class _Text(_File):
         """See `_Binary`."""
         rows = [(*self.integers("Q"), *self.doubles(7)) for _ in self.records(0)]
         values = np.array(rows, dtype=np.float64).reshape(-1, 8)
+        if not np.isfinite(values).all():
+            raise self.damaged("it has points that are not finite")
         table = np.zeros(len(values), dtype=POINT)
         table["id"], table["p_W"], table["error"] = values[:, 0], values[:, 1:4], values[:, 7]
         table["colour"] = np.clip(values[:, 4:7], 0.0, 255.0)
         return table
 
-    def _doubles(self, count: int) -> F64:
+    def doubles(self, count: int) -> F64:
+        """See `_File`."""
         return np.array([self._next(float) for _ in range(count)])
 
     def _next(self, kind: Callable[[str], _T]) -> _T:
@@ -213,12 +209,5 @@ class _Text(_File):
 
 Records = _Binary | _Text
 """A file of a model; both forms have the same methods."""
-
-
-def records_of(path: Path) -> Records:
-    """Open a file by its suffix.
-
-    Raises:
-        MapError: It cannot be read.
-    """
-    return _Binary(path) if path.suffix == ".bin" else _Text(path)
+FILES_OF: dict[str, Callable[[Path], Records]] = {".bin": _Binary, ".txt": _Text}
+"""Files by their suffix."""

@@ -46,14 +46,16 @@ class BodyFrames:
     mission_rig: I64  # (M,) rows of rigs
     mission_row: I64  # (M,) rows of the side file's missions, -1 = none
     side_vertex: I64  # (V,) rows of the side file's vertices, -1 = none
+    side_image: I64  # (N,) rows of the side file's images that the model's are, -1 = none
     T_I_R: F64  # (R, 7) by rig row
 
 
-def body_frames(model: ColmapModel, times_ns: I64, side: SideFile) -> BodyFrames:
+def body_frames(model: ColmapModel, times_ns: I64, side: SideFile, side_image: I64) -> BodyFrames:
     """Put the frames that have images into missions: those of the side file, else one of each rig.
 
     Args:
         times_ns: Times (N,) of its images.
+        side_image: Rows (N,) of the side file's images that they are, -1 = none.
 
     Raises:
         UserError: Two frames of a mission have the same time.
@@ -63,7 +65,7 @@ def body_frames(model: ColmapModel, times_ns: I64, side: SideFile) -> BodyFrames
     time_ns = np.minimum.reduceat(times_ns[order], first)
     none = np.full(len(frame), -1, dtype=np.int64)
     rig, rig_ids = model.frames.rig[frame], np.array([rig.id for rig in model.rigs])
-    side_vertex = picked(side.image_vertex, side_images(model, side)[order[first]], none)
+    side_vertex = picked(side.image_vertex, side_image[order[first]], none)
     time_ns = picked(side.vertex_time_ns, side_vertex, time_ns)
     side_mission = picked(side.vertex_mission, side_vertex, none)
     T_I_R = picked(side.T_I_R, rows_of(side.rig, rig_ids), se3.identity(len(rig_ids)))
@@ -88,6 +90,7 @@ def body_frames(model: ColmapModel, times_ns: I64, side: SideFile) -> BodyFrames
         mission_rig=groups[:, 2],
         mission_row=groups[:, 1],
         side_vertex=side_vertex[order],
+        side_image=side_image,
         T_I_R=T_I_R,
     )
 
@@ -119,13 +122,23 @@ def map_of_model(
         MapError: A rig lacks a pose of a camera that has images.
         UserError: maplab lacks a camera model.
     """
-    rng = np.random.default_rng(_seed(model, times_ns))
+    digest = hashlib.blake2b("\n".join(model.images.name).encode(), digest_size=16)
+    for column in (times_ns, model.images.T_C_W, model.images.uv, model.point_id):
+        digest.update(np.ascontiguousarray(column).tobytes())
+    rng = np.random.default_rng(int.from_bytes(digest.digest(), "little"))
     T_G_I = se3.compose(alignment.apply_similarity(T_G_W, scale, bodies.T_W_R), bodies.T_R_I)
     sensors, sensor_id = _sensors(model, bodies, side, scale, is_metric, rng)
     frames, images = _frames(model, bodies, times_ns, side, rng)
     keypoints = ragged_rows(model.images.keypoint_start, images)
     landmarks, landmark_of, unobserved = _landmarks(
-        model, side, frames, keypoints, se3.transform(T_G_W, scale * model.points.p_W), T_G_I, rng
+        model,
+        side,
+        bodies,
+        frames,
+        keypoints,
+        se3.transform(T_G_W, scale * model.points.p_W),
+        T_G_I,
+        rng,
     )
     count = len(bodies.frame)
     missions = len(bodies.mission_rig)
@@ -154,12 +167,6 @@ def map_of_model(
         transformation_edges=_edges(bodies, T_G_I, sensor_id, edge_sigma, rng),
     )
     return ImportedModel(vi_map, images, keypoints, unobserved)
-
-
-def side_images(model: ColmapModel, side: SideFile) -> I64:
-    """Return the rows (N,) of the side file's images that the model's images are, -1 = new."""
-    row_of = {name: row for row, name in enumerate(side.image_name.tolist())}
-    return np.array([row_of.get(name, -1) for name in model.images.name], dtype=np.int64)
 
 
 def _sensors(
@@ -223,7 +230,7 @@ def _frames(
         name = model.images.name[image[twice[0] + 1]]
         raise MapError(f"image {name}: its frame has two images of the same camera")
     count = len(image)
-    rows = side_images(model, side)[image]
+    rows = bodies.side_image[image]
     table = tables.Frames.filled(
         count,
         id=_restored(random_ids(count, rng), rows, side.image_frame_id),
@@ -240,6 +247,7 @@ def _frames(
 def _landmarks(
     model: ColmapModel,
     side: SideFile,
+    bodies: BodyFrames,
     frames: tables.Frames,
     keypoints: I64,
     p_G: F64,
@@ -254,7 +262,7 @@ def _landmarks(
     store = vertex[first]  # keypoints are in the order of vertices
     landmark = np.full(len(keypoints), -1, dtype=np.int64)
     landmark[observing] = np.searchsorted(rows, point[observing])
-    known = _same_points(model, side, model.points.id[rows])
+    known = _same_points(model, side, bodies.side_image, model.points.id[rows])
     good = np.full(len(rows), int(tables.LandmarkQuality.GOOD))
     table = tables.Landmarks.filled(
         len(rows),
@@ -266,12 +274,11 @@ def _landmarks(
     return table, landmark, len(model.points.id) - len(rows)
 
 
-def _same_points(model: ColmapModel, side: SideFile, ids: I64) -> I64:
+def _same_points(model: ColmapModel, side: SideFile, side_image: I64, ids: I64) -> I64:
     """Return the rows of the side file's points (L,) by id, -1 unless their observation is there."""
     rows = rows_of(side.point, ids)
     image_of_row = np.full(len(side.image_name), -1, dtype=np.int64)
-    named = side_images(model, side)
-    image_of_row[named[named >= 0]] = np.flatnonzero(named >= 0)
+    image_of_row[side_image[side_image >= 0]] = np.flatnonzero(side_image >= 0)
     image = image_of_row[side.point_image]
     keypoint = side.point_keypoint
     inside = (image >= 0) & (keypoint >= 0) & (keypoint < model.images.keypoint_count[image])
@@ -323,10 +330,3 @@ def _restored(ids: U64, rows: I64, known: U64) -> U64:
     restored = ids.copy()
     restored[once] = known[rows[once]]
     return restored
-
-
-def _seed(model: ColmapModel, times_ns: I64) -> int:
-    digest = hashlib.blake2b("\n".join(model.images.name).encode(), digest_size=16)
-    for column in (times_ns, model.images.T_C_W, model.images.uv, model.point_id):
-        digest.update(np.ascontiguousarray(column).tobytes())
-    return int.from_bytes(digest.digest(), "little")
