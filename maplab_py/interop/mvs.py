@@ -11,7 +11,7 @@ import numpy as np
 from maplab_py.array_types import F64, I64, U8
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.colmap import model as colmap
-from maplab_py.interop.colmap.writing import binary_files
+from maplab_py.interop.colmap.records import binary_files
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from maplab_py.distinct import distinct
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3
 from maplab_py.interop.colmap import model as colmap
-from maplab_py.interop.colmap import pycolmap_files, undistortion, writing
+from maplab_py.interop.colmap import pycolmap_files, records, undistortion
 from maplab_py.interop.colmap.options import ColmapExportOptions, ColmapExportReport
 from maplab_py.interop.colmap.pycolmap_files import DATABASE
 from maplab_py.output_files import check_writable, copy_file, write_bytes
@@ -58,7 +58,7 @@ def export_colmap(
         if options.colmap_format == "text":
             pycolmap_files.write_text_model(model, Path(work), folder, overwrite=overwrite)
         else:
-            for file, content in writing.binary_files(model).items():
+            for file, content in records.binary_files(model).items():
                 write_bytes(folder / file, content, overwrite=overwrite)
         write_bytes(folder / colmap.FILE_NAME, [exported.side_file.content()], overwrite=overwrite)
         if options.colmap_database:

@@ -14,7 +14,7 @@ from maplab_py.array_types import F64, I64
 from maplab_py.cancellation import check_cancelled
 from maplab_py.errors import MapError, MaplabError
 from maplab_py.interop.colmap import model as colmap
-from maplab_py.interop.colmap.writing import binary_files
+from maplab_py.interop.colmap.records import binary_files
 from maplab_py.output_files import copy_file
 from maplab_py.vimap import VIMap
 from maplab_py.vimap.descriptors import DescriptorDepth, FeatureType

@@ -14,7 +14,7 @@ from maplab_py.interop.colmap.exporting import export_colmap, model_of_map
 from maplab_py.interop.colmap.importing import import_colmap
 from maplab_py.interop.colmap.model import FILE_NAME, FILES, ColmapModel
 from maplab_py.interop.colmap.options import ColmapExportOptions, ColmapImportOptions
-from maplab_py.interop.colmap.writing import binary_files
+from maplab_py.interop.colmap.records import binary_files
 from maplab_py.vimap import VIMap
 from tests.support.scene import Scene
 

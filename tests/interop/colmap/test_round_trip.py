@@ -135,7 +135,7 @@ def test_a_refined_model_keeps_the_ids_that_still_apply(tmp_path: Path) -> None:
     filtered = dataclasses.replace(
         exported, images=dataclasses.replace(exported.images, point=point)
     )
-    from maplab_py.interop.colmap.writing import binary_files
+    from maplab_py.interop.colmap.records import binary_files
 
     for name, content in binary_files(filtered).items():
         (tmp_path / name).write_bytes(b"".join(content))
