@@ -174,10 +174,14 @@ class TsdfGrid:
         count, enough = len(self.coordinates), np.float64(max(min_weight, 1e-12))
         parts = [slice(k, k + _BLOCKS_AT_A_TIME) for k in range(0, count, _BLOCKS_AT_A_TIME)]
         number = np.full((count, *BLOCK_SHAPE), -1, dtype=np.int32)
+        before, after = (
+            np.stack([rows_in(self.coordinates, self.coordinates + step * o) for o in _CORNERS])
+            for step in (-1, 1)
+        )
         points, cells, signs = [np.empty((0, 3))], [], []
         for part in parts:
-            weight = self._with_border(self.weight, part, 1, 0.0)
-            distance = self._with_border(self.distance, part, 1, 0.0)
+            weight = _with_border(self.weight, after[:, part], 1, 0.0)
+            distance = _with_border(self.distance, after[:, part], 1, 0.0)
             cell, corner = _crossed_cells(np.where(weight >= enough, distance, np.nan), most)
             voxel = BLOCK_SIDE * self.coordinates[part][cell[:, 0]] + cell[:, 1:]
             first = sum(map(len, points))
@@ -187,29 +191,28 @@ class TsdfGrid:
             signs.append(corner[:, [0, 1, 2, 4]] < 0.0)
         quads = [np.empty((0, 4), dtype=np.int32)]
         for part, cell, is_negative in zip(parts, cells, signs, strict=True):
-            border = self._with_border(number, part, -1, -1)
+            border = _with_border(number, before[:, part], -1, -1)
             quads.append(_quads(border, cell, is_negative))
         return _triangulate(np.concatenate(points), np.concatenate(quads))
 
-    def _with_border(self, voxels: Any, part: slice, step: int, fill: float) -> Any:
-        """Return the voxels (b, 9, 9, 9) of blocks and of the next ones along x, y and z.
 
-        Args:
-            voxels: Values (B, 8, 8, 8).
-            part: Blocks.
-            step: 1 for the next blocks, -1 for the ones before.
-            fill: Value of voxels of blocks that are not there.
-        """
-        inner, beyond, beside = (slice(8), 8, 0) if step > 0 else (slice(1, 9), 0, 7)
-        blocks = self.coordinates[part]
-        result = np.full((len(blocks), *(BLOCK_SIDE + 1,) * 3), fill, dtype=voxels.dtype)
-        for offset in np.ndindex(2, 2, 2):
-            row = rows_in(self.coordinates, blocks + step * np.array(offset))
-            there = np.flatnonzero(row >= 0)
-            to = tuple(beyond if shift else inner for shift in offset)
-            of = tuple(beside if shift else slice(None) for shift in offset)
-            result[(there, *to)] = voxels[(row[there], *of)]
-        return result
+def _with_border(voxels: Any, rows: I64, step: int, fill: float) -> Any:
+    """Return the voxels (b, 9, 9, 9) of blocks and of the next ones along x, y and z.
+
+    Args:
+        voxels: Values (B, 8, 8, 8).
+        rows: Rows (8, b) of the blocks and of those beside them, at the offsets `_CORNERS`; -1 = none.
+        step: 1 for the next blocks, -1 for the ones before.
+        fill: Value of voxels of blocks that are not there.
+    """
+    inner, beyond, beside = (slice(8), 8, 0) if step > 0 else (slice(1, 9), 0, 7)
+    result = np.full((rows.shape[1], *(BLOCK_SIDE + 1,) * 3), fill, dtype=voxels.dtype)
+    for offset, row in zip(_CORNERS.tolist(), rows, strict=True):
+        there = np.flatnonzero(row >= 0)
+        to = tuple(beyond if shift else inner for shift in offset)
+        of = tuple(beside if shift else slice(None) for shift in offset)
+        result[(there, *to)] = voxels[(row[there], *of)]
+    return result
 
 
 def _crossed_cells(values: F32, most: float) -> tuple[I64, F32]:
