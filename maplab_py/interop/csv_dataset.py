@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from maplab_py.array_types import F32, I64, U8, NDArray
+from maplab_py.array_types import F32, I64, U8, NDArray, mask_of
 from maplab_py.interop.text_table import format_rows
 from maplab_py.options import Options, option
 from maplab_py.output_files import check_writable, write_text
@@ -152,8 +152,7 @@ def _part_of(vi_map: VIMap, mission: int, options: CsvExportOptions) -> _Part:
     frames = ragged_rows(vi_map.frame_start, vertices)
     keypoints = ragged_rows(vi_map.keypoint_start, frames)
     landmark = vi_map.keypoints.landmark[keypoints]
-    wanted = np.zeros(len(vi_map.landmarks), dtype=np.bool_)
-    wanted[landmark[landmark >= 0]] = True
+    wanted = mask_of(len(vi_map.landmarks), landmark[landmark >= 0])
     wanted |= vi_map.vertices.mission[vi_map.landmarks.vertex] == mission
     if options.only_high_quality_landmarks:
         wanted &= vi_map.landmarks.quality == LandmarkQuality.GOOD

@@ -26,7 +26,7 @@ from maplab_py.algorithms.relaxation.relaxation import relax
 from maplab_py.algorithms.vi_optimization.local import LocalReport, optimize_around
 from maplab_py.algorithms.vi_optimization.optimization import optimize
 from maplab_py.algorithms.vi_optimization.options import VIOptimizationOptions
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64, Mask, mask_of
 from maplab_py.errors import EstimationError
 from maplab_py.progress import SILENT, Progress
 from maplab_py.server import alignments, spool
@@ -246,8 +246,7 @@ class Merger:
 
     def _searched_vertices(self, whole: VIMap, rows: I64, similar: Sequence[int]) -> Mask:
         """Return the vertices (V,) in which loops with new ones (rows) are looked for."""
-        result = np.zeros(len(whole.vertices), dtype=np.bool_)
-        result[rows] = True
+        result = mask_of(len(whole.vertices), rows)
         if not self._merging.enable_visual_loop_closure:
             return result
         for number in similar:

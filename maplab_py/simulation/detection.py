@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64, NDArray, Rows
+from maplab_py.array_types import F64, I64, NDArray, Rows, mask_of
 from maplab_py.geometry import so3
 from maplab_py.sensors import Camera
 from maplab_py.simulation.cameras import field_of_view_radius, pixels_of
@@ -253,8 +253,7 @@ def swap_identities(track: I64, frame: I64, uv: F64, share: float, rng: np.rando
     other = others[np.arange(wanted), np.argmin(gap, axis=1)]
     pair = np.stack([track[track_a], track[other]], axis=1)
     _, first, count = np.unique(pair, return_index=True, return_counts=True)
-    once = np.zeros(pair.size, dtype=np.bool_)
-    once[first[count == 1]] = True
+    once = mask_of(pair.size, first[count == 1])
     chosen = np.all(once.reshape(pair.shape), axis=1)
     partner = np.arange(tracks)
     since = np.full(tracks, np.iinfo(np.int64).max)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from maplab_py.array_types import F32, F64, I64, U8
+from maplab_py.array_types import F32, F64, I64, U8, mask_of
 from maplab_py.compilation import compiled, prange
 from maplab_py.errors import EstimationError, UserError
 from maplab_py.input_files import read_npz
@@ -149,8 +149,7 @@ def _training_rows(track: I64) -> I64:
     if len(tracks) < _MIN_TRAINING_TRACKS:
         return np.zeros(0, dtype=np.int64)
     step = max(int(np.ceil(length[tracks].sum() / MAX_TRAINING_SAMPLES)), 1)
-    taken = np.zeros(len(labels), dtype=np.bool_)
-    taken[tracks[::step]] = True
+    taken = mask_of(len(labels), tracks[::step])
     return np.asarray(order[taken[index]], dtype=np.int64)
 
 

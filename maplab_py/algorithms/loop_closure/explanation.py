@@ -115,15 +115,10 @@ def explain_closure(vi_map: VIMap, row: int, options: LoopClosureOptions) -> Clo
     failed = [gate for gate in gates if gate.failed[row]]
     if verdict is not Verdict.ACCEPTED and not failed:
         lines.append(GateLine(verdict.value, "yes", "no", "failed", ""))
+    shared = ("query", "query_s", "place", "place_s", "verdict", "use", "weight")
     return ClosureExplanation(
         closure=line.id,
-        query=line.query,
-        query_s=line.query_s,
-        place=line.place,
-        place_s=line.place_s,
-        verdict=line.verdict,
-        use=line.use,
-        weight=line.weight,
+        **{name: getattr(line, name) for name in shared},
         gates=tuple(lines),
         summary=_summary_of_closure(
             verdict, failed, line.merged, acceptance(vi_map, closures, row, options)

@@ -12,7 +12,7 @@ import numpy as np
 
 from maplab_py.algorithms.landmarks.evidence import session_times_s
 from maplab_py.algorithms.map_update.options import Change, ChangeReport
-from maplab_py.algorithms.map_update.visibility import Sightings, outcome, predict
+from maplab_py.algorithms.map_update.visibility import outcome, predict
 from maplab_py.array_types import F64, I64, Mask, mask_of
 from maplab_py.errors import UserError
 from maplab_py.progress import SILENT, Progress
@@ -123,8 +123,7 @@ def missing_regions(
     for mission in np.flatnonzero(by).tolist():
         sightings = predict(vi_map, mission, progress)
         mine = of[sightings.landmark]
-        columns = (getattr(sightings, f.name)[mine] for f in dataclasses.fields(Sightings))
-        session, _ = outcome(vi_map, mission, Sightings(*columns))
+        session, _ = outcome(vi_map, mission, sightings.take(mine))
         predicted[session.landmark] += session.predicted
         matched[session.landmark] += session.matched
         sessions[session.landmark] += 1

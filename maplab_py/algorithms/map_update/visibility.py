@@ -5,8 +5,6 @@ observers, and the landmarks that the image observes around it are not much near
 observes it, or a similar descriptor is near its projection.
 """
 
-import dataclasses
-
 import numpy as np
 
 from maplab_py.algorithms.landmarks.evidence import Session, session_times_s
@@ -14,7 +12,7 @@ from maplab_py.algorithms.landmarks.sightings import cameras_of
 from maplab_py.algorithms.localization.database import Sights
 from maplab_py.algorithms.loop_closure.features import most_frequent_kind
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.array_types import F64, I64, Mask
+from maplab_py.array_types import F64, I64, Mask, Rows, mask_of
 from maplab_py.distinct import distinct
 from maplab_py.geometry import se3, so3
 from maplab_py.progress import SILENT, Progress
@@ -40,8 +38,7 @@ _PLACE_M, _SECTORS = 1.0, 8
 """Images of one place: within a cell of that size, in the same of so many directions."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Sightings:
+class Sightings(Rows):
     """Pairs (N,) of an image and a landmark that should be visible in it."""
 
     frame: I64
@@ -60,14 +57,16 @@ def predict(vi_map: VIMap, mission: int, progress: Progress = SILENT) -> Sightin
     """
     search = _Search(vi_map, mission)
     frames = np.flatnonzero(vi_map.vertices.mission[vi_map.frames.vertex] == mission)
-    parts = []
+    parts = [_nothing()]
     for number, frame in enumerate(frames.tolist()):
         progress.step(number, len(frames), "images")
         parts.append(search.sightings(frame))
-    columns = zip(*parts, strict=True) if parts else ([],) * 6
-    kinds = (np.int64, np.int64, np.float64, np.int64, np.bool_, np.bool_)
-    empty = (np.zeros(0, dtype=kind) for kind in kinds)
-    return Sightings(*(np.concatenate([e, *c]) for e, c in zip(empty, columns, strict=True)))
+    return Sightings.concatenate(parts)
+
+
+def _nothing() -> Sightings:
+    rows, no = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.bool_)
+    return Sightings(rows, rows, np.zeros(0), rows, no, no)
 
 
 def outcome(vi_map: VIMap, mission: int, sightings: Sightings) -> tuple[Session, float]:
@@ -108,8 +107,7 @@ class _Search:
         eyes_G = vi_map.T_G_I[vi_map.keypoint_vertex[others], 4:]
         landmark = vi_map.keypoints.landmark[others].astype(np.int64)
         self._sights = Sights.of(vi_map.p_G, landmark, eyes_G, _TURN_RAD)
-        self._is_old = np.zeros(len(vi_map.landmarks), dtype=np.bool_)
-        self._is_old[vi_map.keypoints.landmark[others]] = True
+        self._is_old = mask_of(len(vi_map.landmarks), vi_map.keypoints.landmark[others])
         self._is_old &= vi_map.landmarks.quality == LandmarkQuality.GOOD
         self._old = np.flatnonzero(self._is_old)
         every = np.ones(len(vi_map.frames), dtype=np.bool_)
@@ -126,16 +124,13 @@ class _Search:
         self._is_good = vi_map.landmarks.quality == LandmarkQuality.GOOD
         self._random = np.random.default_rng(0).permutation(self._old)  # landmarks for comparison
 
-    def sightings(self, frame: int) -> tuple[I64, I64, F64, I64, Mask, Mask]:
-        """Return the columns of the sightings of an image."""
+    def sightings(self, frame: int) -> Sightings:
+        """Return the sightings of an image."""
         vi_map = self._map
         start = vi_map.keypoint_start
         keypoints = np.arange(start[frame], start[frame + 1])
-        none = np.zeros(0, dtype=np.int64)
-        no = none.astype(np.bool_)
-        nothing = none, none, none.astype(np.float64), none, no, no
         if len(keypoints) == 0 or len(self._old) == 0:
-            return nothing
+            return _nothing()
         camera, T_I_C, _ = next(iter(cameras_of(vi_map, keypoints[:1])))
         T_G_C = se3.compose(vi_map.T_G_I[vi_map.frames.vertex[frame]], T_I_C)
         rows = self._in_reach(T_G_C[4:])
@@ -145,22 +140,27 @@ class _Search:
         inside &= np.all(uv < np.array([camera.width_px, camera.height_px]) - _BORDER_PX, axis=1)
         rows, uv, depth_m = rows[inside], uv[inside], np.linalg.norm(p_C[inside], axis=1)
         if len(rows) == 0:
-            return nothing
+            return _nothing()
         near = self._near(keypoints, uv)
         similar = self._most_similar(rows, *near)
         is_matched = (similar >= 0) | np.isin(rows, vi_map.keypoints.landmark[keypoints])
         other = self._random[np.searchsorted(self._old, rows)]
         is_false = self._most_similar(other, *near) >= 0
-        kept = is_matched | ~self._is_hidden(keypoints, uv, depth_m, T_G_C[4:])
-        rows = rows[kept]
         axis_G = so3.rotate(T_G_C[:4], np.array([0.0, 0.0, 1.0]))
-        heading = np.full(len(rows), np.arctan2(axis_G[1], axis_G[0]))
-        similar, is_matched, is_false = similar[kept], is_matched[kept], is_false[kept]
-        frames = np.full(len(rows), frame)
-        if np.count_nonzero(is_matched) >= max(_MIN_MATCHED, _MIN_MATCHED_SHARE * len(rows)):
-            return frames, rows, heading, similar, is_matched, is_false
-        m = is_matched  # the pose is doubtful: what the image does not see may be elsewhere in it
-        return frames[m], rows[m], heading[m], similar[m], is_matched[m], is_false[m]
+        seen = Sightings(
+            frame=np.full(len(rows), frame),
+            landmark=rows,
+            heading_rad=np.full(len(rows), np.arctan2(axis_G[1], axis_G[0])),
+            keypoint=similar,
+            is_matched=is_matched,
+            is_false=is_false,
+        )
+        seen = seen.take(is_matched | ~self._is_hidden(keypoints, uv, depth_m, T_G_C[4:]))
+        least = max(_MIN_MATCHED, _MIN_MATCHED_SHARE * len(seen))
+        if np.count_nonzero(seen.is_matched) >= least:
+            return seen
+        # the pose is doubtful: what the image does not see may be elsewhere in it
+        return seen.take(seen.is_matched)
 
     def _in_reach(self, eye: F64) -> I64:
         """Return the old landmarks that are seen from a place (3,), as far as direction and distance tell."""

@@ -1,7 +1,5 @@
 """Trajectories from above, coloured by the information of segments, as SVG (Schneider 2019, figure 7.1)."""
 
-import csv
-import io
 from collections.abc import Sequence
 
 import numpy as np
@@ -84,10 +82,6 @@ def as_csv(segments: list[tuple[str, int, int]], information: Sequence[float]) -
         segments: Mission, begin and end [ns] of every segment.
         information: Scores (S,).
     """
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(("mission", "start_ns", "end_ns", "information"))
-    writer.writerows(
-        (*segment, score) for segment, score in zip(segments, information, strict=True)
-    )
-    return text.getvalue()
+    rows = zip(segments, information, strict=True)
+    lines = [f"{mission},{start},{end},{score}\n" for (mission, start, end), score in rows]
+    return "".join(["mission,start_ns,end_ns,information\n", *lines])

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from maplab_py.array_types import F64, I32, I64, Mask
+from maplab_py.array_types import F64, I32, I64, Mask, mask_of
 from maplab_py.errors import EstimationError
 from maplab_py.estimation.codegen.kernels import residual_kernel, window_kernels
 from maplab_py.estimation.kernels.window_arguments import FRAME_SIZE, WindowPoint
@@ -371,8 +371,7 @@ class FixedLagSmoother:
 
     def _remove(self, observations: I64) -> None:
         if len(observations):
-            is_removed: Mask = np.zeros(len(self.tracks.observations), dtype=np.bool_)
-            is_removed[observations] = True
+            is_removed = mask_of(len(self.tracks.observations), observations)
             self.tracks.remove_observations(is_removed, self._poses())
 
     # -- what a localised smoother adds -----------------------------------------------------------

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.array_types import F64, I32, I64, Mask, Rows
+from maplab_py.array_types import F64, I32, I64, Mask, Rows, mask_of
 from maplab_py.estimation.kernels import window as kernels
 from maplab_py.estimation.kernels.window_arguments import WindowData
 from maplab_py.estimation.window.cameras import CameraPoses
@@ -118,9 +118,7 @@ class Tracks:
 
     def is_seen_by(self, frame: int) -> Mask:
         """Return which tracks (T,) a frame observes."""
-        seen: Mask = np.zeros(len(self), dtype=np.bool_)
-        seen[self.observations.row[self.observations.frame == frame]] = True
-        return seen
+        return mask_of(len(self), self.observations.row[self.observations.frame == frame])
 
     def grouped(self, rows: I64) -> tuple[I64, I64]:
         """Return observations of some tracks (R,), track after track, and their offsets (R + 1,)."""
@@ -229,9 +227,7 @@ class Tracks:
         self.remove_observations(self._mask_of(rows)[self.observations.row], poses)
 
     def _mask_of(self, rows: I64) -> Mask:
-        result: Mask = np.zeros(len(self), dtype=np.bool_)
-        result[rows] = True
-        return result
+        return mask_of(len(self), rows)
 
     def _unknown(self, track_id: I64) -> I64:
         """Return ids that no track has, ascending, each once."""

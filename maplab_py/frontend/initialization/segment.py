@@ -7,7 +7,7 @@ from typing import Self
 
 import numpy as np
 
-from maplab_py.array_types import F64, I32, I64
+from maplab_py.array_types import F64, I32, I64, mask_of
 from maplab_py.estimation.imu.inertial_data import InertialData
 from maplab_py.estimation.window.frame import WindowFrame
 from maplab_py.frontend.imu_buffer import joined_samples
@@ -110,8 +110,7 @@ class History:
                 chosen.append(row)
         chosen.reverse()
         edges = [_joined(frames[a + 1 : b + 1]) for a, b in itertools.pairwise(chosen)]
-        is_chosen = np.zeros(len(frames), dtype=np.bool_)
-        is_chosen[chosen] = True
+        is_chosen = mask_of(len(frames), chosen)
         others = np.flatnonzero(~is_chosen[chosen[0] :]) + chosen[0]
         kept = ObservedFrames.of([frames[row] for row in chosen])
         between = ObservedFrames.of([frames[row] for row in others.tolist()])

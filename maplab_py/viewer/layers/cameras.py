@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.array_types import F64, I64
+from maplab_py.array_types import F64, I64, mask_of
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3
 from maplab_py.sensors import Camera, CameraRig, SensorSet, projection
@@ -119,8 +119,7 @@ def landmark_observers(drawing: Drawing, landmarks: I64, limit: int) -> Layer:
     vi_map = drawing.vi_map
     counts = np.diff(vi_map.observation_start)
     every = max(1, -(-int(counts[landmarks].sum()) // max(limit, 1)))
-    chosen = np.zeros(len(vi_map.landmarks), dtype=np.bool_)
-    chosen[landmarks[::every]] = True
+    chosen = mask_of(len(vi_map.landmarks), landmarks[::every])
     keypoints = vi_map.observations[chosen[vi_map.keypoints.landmark[vi_map.observations]]]
     landmark = vi_map.keypoints.landmark[keypoints].astype(np.int64)
     centres, vertices = camera_centres(drawing, keypoints)
