@@ -59,6 +59,8 @@ class MessageMaker:
         """
         self._is_ros_2 = is_ros_2
         self._store: Any = message_types(is_ros_2=is_ros_2)
+        self._last_s = (1 << (31 if is_ros_2 else 32)) - 1
+        self._nested: dict[str, list[tuple[int, str, bool]]] = {}  # place, type; several of them
 
     def imu(self, times_ns: I64, accel_gyro: F64, frame: str) -> list[bytes]:
         """Return sensor_msgs/Imu without orientation.
@@ -221,11 +223,10 @@ class MessageMaker:
             UserError: The time is before 1970, or after what the messages can hold.
         """
         time = divmod(stamp_ns, _S_TO_NS)
-        last = np.iinfo(np.int32).max if self._is_ros_2 else np.iinfo(np.uint32).max
-        if not 0 <= time[0] <= last:
+        if not 0 <= time[0] <= self._last_s:
             raise UserError(
-                f"the time {stamp_ns} ns cannot be written into a bag: stamps go from 0 to {last} s; move "
-                "the stamps of the map"
+                f"the time {stamp_ns} ns cannot be written into a bag: stamps go from 0 to {self._last_s} s; "
+                "move the stamps of the map"
             )
         return (time, frame) if self._is_ros_2 else (0, time, frame)
 
@@ -235,12 +236,20 @@ class MessageMaker:
 
     def _message(self, kind: str, fields: Any) -> Any:
         """Return a message of its fields, in which a sequence stands for a message, or a list for several."""
+        if kind not in self._nested:
+            self._nested[kind] = [
+                (place, content if node == _NAME else content[0][1], node != _NAME)
+                for place, (_, (node, content)) in enumerate(self._store.fielddefs[kind][1])
+                if node == _NAME or content[0][0] == _NAME
+            ]
         parts = list(fields)
-        for place, (_, (node, content)) in enumerate(self._store.fielddefs[kind][1]):
-            if node == _NAME:
-                parts[place] = self._message(content, parts[place])
-            elif isinstance(parts[place], list):
-                parts[place] = [self._message(content[0][1], part) for part in parts[place]]
+        for place, name, are_several in self._nested[kind]:
+            part = parts[place]
+            parts[place] = (
+                [self._message(name, entry) for entry in part]
+                if are_several
+                else self._message(name, part)
+            )
         return self._store.types[kind](*parts)
 
 
