@@ -9,15 +9,14 @@ from functools import cache
 from operator import attrgetter
 from typing import Any
 
+import llvmlite.binding as llvm
 import numba
 import numba.extending
-from numba.core import cgutils, entrypoints, environment, event, ir
+from numba.core import cgutils, entrypoints, environment, event
 from numba.core.codegen import CPUCodeLibrary, JITCodeLibrary, JITCPUCodegen
 from numba.core.environment import lookup_environment
 from numba.core.lowering import Lower
-from numba.core.postproc import PostProcessor, VariableLifetime
 from numba.core.targetconfig import ConfigStack
-from numba.core.transforms import canonicalize_cfg
 
 types: Any = numba.types
 
@@ -25,50 +24,8 @@ types: Any = numba.types
 @cache
 def change_compiler() -> None:
     """Make all changes of this module but those that loading kernels needs."""
-    _leave_out_what_nobody_reads()
     _remember_types()
-    _borrow_arguments()
     _index_directly()
-
-
-def _leave_out_what_nobody_reads() -> None:
-    """Leave out events, lives of variables before references are counted, and the shapes in an error's text.
-
-    They are a third of the time: functions that print numbers are compiled for each assignment to a part
-    of an array.
-    """
-    from numba.np import arrayobj
-
-    run = PostProcessor.run
-
-    def post_process(self: Any, emit_dels: bool = False, extend_lifetimes: bool = False) -> None:
-        function = self.func_ir
-        if emit_dels or function.is_generator:
-            run(self, emit_dels, extend_lifetimes)
-            return
-        function.blocks = canonicalize_cfg(function.blocks)
-        function.variable_lifetime = VariableLifetime(function.blocks)
-        function.generator_info = None
-
-    def variables(_: Any, value: Any) -> list[Any]:
-        result, rest = [], [value]
-        while rest:
-            each = rest.pop()
-            if isinstance(each, ir.Var):
-                result.append(each)
-            elif isinstance(each, ir.Inst):
-                result += each.list_vars()
-            elif isinstance(each, list | tuple | dict):
-                rest += reversed(each.values() if isinstance(each, dict) else each)
-        return result
-
-    def raise_error(source: Any, target: Any) -> None:
-        """Stand for the function that raises the error in kernels."""
-
-    PostProcessor.run, ir.Inst._rec_list_vars = post_process, variables
-    event.start_event = event.end_event = lambda *_, **__: None
-    numba.extending.overload(raise_error)(arrayobj.ol_raise_with_shape_context_generic)
-    arrayobj.raise_with_shape_context = raise_error
 
 
 def _remember_types() -> None:
@@ -109,7 +66,7 @@ def _remember_types() -> None:
 
 
 def load_little() -> None:
-    """Let numba load kernels without its extensions and the modules of the functions that they contain.
+    """Let numba load kernels without events, extensions, and the modules of the functions in them.
 
     Compiled code does not read the names in those modules; scipy, which some import, takes 0.15 s.
     """
@@ -120,6 +77,7 @@ def load_little() -> None:
 
     environment._rebuild_env = make_environment
     entrypoints._already_initialized = True
+    event.start_event = event.end_event = lambda *_, **__: None
 
 
 def make_code_when_needed() -> None:
@@ -131,6 +89,7 @@ def make_code_when_needed() -> None:
     library, set_environment = CPUCodeLibrary, JITCPUCodegen.set_env
     optimise, make_code = library._optimize_final_module, library._finalize_final_module
     find, serialise = JITCodeLibrary.get_pointer_to_function, library.serialize_using_object_code
+    link = library._get_module_for_linking
 
     def finalise(self: Any) -> None:
         self._finalize_dynamic_globals()
@@ -153,8 +112,29 @@ def make_code_when_needed() -> None:
         return find(self, name)
 
     def serialize_using_object_code(self: Any) -> Any:
-        is_code = getattr(self, "_compiled_object", None)
-        return serialise(self) if is_code else self.serialize_using_bitcode()
+        if not getattr(self, "_compiled_object", None):
+            return self.serialize_using_bitcode()
+        name, kind, parts = serialise(self)
+        module = self._get_module_for_linking()
+        known = (*module.functions, *module.global_variables)
+        return name, kind, (*parts, sorted(x.name for x in known if not x.is_declaration))
+
+    def deserialise(codegen: Any, state: Any) -> Any:
+        name, kind, parts = state
+        if kind == "bitcode":
+            return codegen._library_class._unserialize(codegen, state)
+        self = codegen.create_library(name)
+        self.enable_object_caching()
+        code, self.bitcode, symbols = parts
+        self._set_compiled_object(code)
+        self._finalize_final_module()
+        codegen._engine._defined_symbols.update(symbols)
+        return self
+
+    def get_module_for_linking(self: Any) -> Any:
+        if bitcode := self.__dict__.pop("bitcode", None):
+            self._shared_module = llvm.parse_bitcode(bitcode)
+        return link(self)
 
     def set_env(self: Any, name: str, environment: Any) -> None:
         if self._engine.is_symbol_defined(name):
@@ -163,106 +143,10 @@ def make_code_when_needed() -> None:
     library._optimize_final_module = lambda _: None
     library._finalize_final_module = finalise
     library.serialize_using_object_code = serialize_using_object_code
+    library._get_module_for_linking = get_module_for_linking
+    JITCPUCodegen.unserialize_library = deserialise
     JITCodeLibrary.get_pointer_to_function = get_pointer_to_function
     JITCPUCodegen.set_env = set_env
-
-
-def _borrow_arguments() -> None:
-    """Let numba count no references to arguments and their parts, which the caller holds during the call.
-
-    Counting is a quarter of the instructions that LLVM gets, and it removes nearly all of them.
-    """
-    lower_inst, delvar = Lower.lower_inst, Lower.delvar
-
-    def lower_statement(self: Any, statement: Any) -> None:
-        context = self.context
-        if isinstance(statement, ir.Assign) and statement.target.name in _borrowed(self):
-            self.context = context.subtarget(enable_nrt=False)
-        try:
-            lower_inst(self, statement)
-        finally:
-            self.context = context
-
-    def delete(self: Any, name: str) -> None:
-        if name in _borrowed(self) or not _has_references(self, name):
-            if name not in self._blk_local_varmap:
-                self._singly_assigned_vars.discard(name)
-        else:
-            delvar(self, name)
-
-    Lower.lower_inst, Lower.delvar = lower_statement, delete
-
-
-def _has_references(lower: Any, name: str) -> bool:
-    return _contains_references(lower.context.data_model_manager, lower.typeof(name))
-
-
-@cache
-def _contains_references(manager: Any, kind: Any) -> bool:
-    return bool(manager[kind].contains_nrt_meminfo())
-
-
-def _borrowed(lower: Any) -> set[str]:
-    """Return the variables of a function that hold nothing but arguments, their parts and views of them."""
-    if "borrowed" not in lower.__dict__:
-        lower.borrowed = set() if lower.generator_info else _find_borrowed(lower)
-    borrowed: set[str] = lower.borrowed
-    return borrowed
-
-
-def _find_borrowed(lower: Any) -> set[str]:
-    values: dict[str, list[Any]] = {}
-    owned = set()  # what the function returns, and what parallel loops set
-    for statement in (each for block in lower.blocks.values() for each in block.body):
-        if isinstance(statement, ir.Assign):
-            values.setdefault(statement.target.name, []).append(statement.value)
-        elif isinstance(statement, ir.Return):
-            owned.add(statement.value.name)
-        elif hasattr(statement, "init_block"):
-            owned.update(statement.redvars)
-            owned.update(
-                x.target.name for x in statement.init_block.body if isinstance(x, ir.Assign)
-            )
-    kinds = types.Array, types.BaseTuple, types.BoundFunction
-    names = {name for name in values if isinstance(lower.typeof(name), kinds)} - owned
-    before = None
-    while before != names:
-        before = names
-        names = {
-            name for name in names if all(_is_borrowed(x, before, lower) for x in values[name])
-        }
-    return names
-
-
-def _is_borrowed(value: Any, names: set[str], lower: Any) -> bool:
-    """Tell whether a value is an argument, or a part or view of what variables with these names hold."""
-
-    def borrows(*variables: Any) -> bool:
-        return all(x.name in names or not _has_references(lower, x.name) for x in variables)
-
-    if isinstance(value, ir.Var):
-        return value.name in names
-    if not isinstance(value, ir.Expr):
-        return isinstance(value, ir.Arg)
-    match value.op:
-        case "getattr" if value.attr == "imag":  # of real numbers, it is made
-            return False
-        case "getattr" | "static_getitem" | "exhaust_iter" | "cast":
-            return value.value.name in names
-        case "getitem":  # an index that is an array makes a copy
-            return value.value.name in names and not _has_references(lower, value.index.name)
-        case "build_tuple":
-            return borrows(*value.items)
-        case "call":
-            function = lower.typeof(value.func.name)
-            is_view = getattr(function, "typing_key", None) == "array.reshape"
-            is_tuple = isinstance(function, types.NamedTupleClass)
-            named = [variable for _, variable in value.kws]
-            rest = [value.vararg] if value.vararg else []
-            return (is_view and borrows(value.func)) or (
-                is_tuple and borrows(*value.args, *named, *rest)
-            )
-    return False
 
 
 def _index_directly() -> None:

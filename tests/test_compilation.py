@@ -7,13 +7,11 @@ import sys
 import tempfile
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
 import pytest
 
-from maplab_py.array_types import F64
-from maplab_py.compilation import TARGET, compiled, numba, target_processor
+from maplab_py.compilation import TARGET, target_processor
 from maplab_py.errors import UserError
 from maplab_py.kernel_cache import check_trusted
 from tests.e2e.support import run_program
@@ -103,68 +101,8 @@ def test_functions_of_kernels_can_be_called_from_python_too(tmp_path: Path) -> N
     program = "import inner; print(inner.scaled(1.5))"
     assert run(tmp_path, f"{PROGRAM}{program}; {program}") == ["49.0", "0", "3.0", "3.0"]
     assert run(tmp_path, f"{program}{PROGRAM}") == ["3.0", "49.0", "1"]
-
-
-class Pair(NamedTuple):
-    first: F64
-    second: F64
-
-
-@compiled()
-def parts(pair: Pair) -> tuple[F64, Pair]:
-    return pair.second[1:].reshape(2, -1), Pair(pair.second, pair.first[:2])
-
-
-@compiled()
-def pick(pair: Pair, is_new: bool) -> tuple[F64, F64, float]:
-    view, swapped = parts(pair)
-    values = swapped.first
-    if is_new:
-        values = np.ones(3)
-        pair = Pair(values, pair.second[np.array([0, 2])])
-    total = 0.0
-    for row in view:
-        total += row.sum() + pair.second[0]
-    return values[1:], swapped.second, total
-
-
-@pytest.mark.parametrize("is_new", [False, True])
-def test_a_kernel_keeps_what_it_returns_and_nothing_else(is_new: bool) -> None:
-    pick(Pair(np.zeros(5), np.zeros(5)), is_new)  # compiles
-    numba.core.runtime.nrt._nrt.memsys_enable_stats()
-    count = numba.core.runtime.rtsys.get_allocation_stats
-    before, first, second = count(), np.arange(5.0), np.arange(10.0, 15.0)
-    known = [sys.getrefcount(each) for each in (first, second)]
-    values, view, total = pick(Pair(first, second), is_new)
-    assert total == 50.0 + 2 * 10.0
-    expected = [1.0, 1.0] if is_new else [11.0, 12.0, 13.0, 14.0]
-    np.testing.assert_array_equal(values, expected)
-    np.testing.assert_array_equal(view, [0.0, 1.0])
-    first[0] = 7.0
-    assert view[0] == 7.0
-    del values, view
-    assert [sys.getrefcount(each) for each in (first, second)] == known
-    after = count()
-    assert after.alloc - before.alloc == after.free - before.free
-    assert after.mi_alloc - before.mi_alloc == after.mi_free - before.mi_free
-
-
-@compiled()
-def made(first: F64) -> tuple[float, float, float]:
-    named, several = Pair(first=first, second=np.ones(40)), (first, np.ones(40))
-    spread, nothing = Pair(*several), first.imag
-    several = (np.zeros(40), np.zeros(40))  # takes the place of what is freed too early
-    return named.second.sum(), spread.second.sum(), nothing.sum() + several[0].sum()
-
-
-def test_a_kernel_holds_what_it_makes_as_long_as_it_is_used() -> None:
-    made(np.zeros(5))  # compiles
-    numba.core.runtime.nrt._nrt.memsys_enable_stats()
-    count = numba.core.runtime.rtsys.get_allocation_stats
-    before = count()
-    assert made(np.ones(5)) == (40.0, 40.0, 0.0)
-    after = count()
-    assert after.mi_alloc - before.mi_alloc == after.mi_free - before.mi_free
+    write(tmp_path, "outer.py", "** 2", "** 3")  # compiled with what was loaded with its code
+    assert run(tmp_path, f"{program}{PROGRAM}") == ["3.0", "343.0", "0"]
 
 
 def test_a_closure_is_never_kept(tmp_path: Path) -> None:

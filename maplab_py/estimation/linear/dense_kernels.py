@@ -12,6 +12,7 @@ import numpy as np
 
 from maplab_py.array_types import F64, NDArray
 from maplab_py.compilation import compiled, numba
+from maplab_py.estimation.linear.scipy_extensions import scipy_extension
 
 # scipy exports the addresses of its bundled Fortran-style routines for Cython; numba can call any
 # address through an external symbol. All arguments are pointers, matrices are column-major, integers
@@ -25,10 +26,8 @@ _REAL = types.CPointer(types.float64)
 
 
 def _routine(module: str, name: str, *arguments: Any) -> Any:
-    symbol = "maplab_py_" + name
-    llvm.add_symbol(
-        symbol, numba.extending.get_cython_function_address("scipy.linalg." + module, name)
-    )
+    symbol, full_name = "maplab_py_" + name, scipy_extension(f"linalg.{module}").__name__
+    llvm.add_symbol(symbol, numba.extending.get_cython_function_address(full_name, name))
     return types.ExternalFunction(symbol, types.void(*arguments))
 
 

@@ -18,11 +18,19 @@ from maplab_py.estimation.linear.nested_dissection import (
 )
 from maplab_py.estimation.linear.pattern import BlockPattern
 from maplab_py.estimation.linear.quotient_graph import QuotientGraph, indistinguishable_nodes
+from maplab_py.estimation.linear.scipy_extensions import scipy_extension
 
 # Eliminating a node connects all its neighbours; eliminating nodes of few neighbours first keeps the
 # factor sparse (Liu 1985, multiple minimum degree). SuperLU inside scipy has that algorithm. An
 # INCOMPLETE factorisation that drops every off-diagonal entry makes it hand out the order without
-# paying for the fill of a factorisation whose numbers nobody needs.
+# paying for the fill of a factorisation whose numbers nobody needs (scipy.sparse.linalg.spilu).
+_SYMMETRIC_ORDER = {
+    "ILU_DropTol": 1.0,
+    "ILU_FillFactor": 1.0,
+    "ColPerm": "MMD_AT_PLUS_A",
+    "DiagPivotThresh": 0.0,
+    "SymmetricMode": True,
+}
 
 
 def minimum_degree(pattern: BlockPattern) -> I64:
@@ -33,9 +41,6 @@ def minimum_degree(pattern: BlockPattern) -> I64:
 
 def minimum_degree_of_groups(graph: QuotientGraph) -> I64:
     """Return the order (groups,) by SuperLU's multiple minimum degree."""
-    from scipy.sparse import csc_array
-    from scipy.sparse.linalg import spilu
-
     if len(graph.rows) == 0:
         return np.arange(len(graph))
     start, neighbours = graph.adjacency(has_diagonal=True)
@@ -43,14 +48,15 @@ def minimum_degree_of_groups(graph: QuotientGraph) -> I64:
     # the diagonal must dominate by far
     entries = np.where(neighbours == column, 1e6 * (len(graph.rows) + 1.0), 1.0)
     del column
-    matrix = csc_array((entries, neighbours, start), shape=(len(graph), len(graph)))
-    factors = spilu(
-        matrix,
-        drop_tol=1.0,
-        fill_factor=1.0,
-        permc_spec="MMD_AT_PLUS_A",
-        diag_pivot_thresh=0.0,
-        options={"SymmetricMode": True},
+    factors = scipy_extension("sparse.linalg._dsolve._superlu").gstrf(
+        len(graph),
+        len(entries),
+        entries,
+        neighbours,
+        start,
+        csc_construct_func=tuple,  # makes the factors when they are asked for
+        ilu=True,
+        options=_SYMMETRIC_ORDER,
     )
     return np.argsort(factors.perm_c).astype(np.int64)
 

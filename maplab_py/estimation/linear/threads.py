@@ -17,13 +17,14 @@ from functools import cache
 from typing import Any
 
 from maplab_py.compilation import numba
+from maplab_py.estimation.linear.scipy_extensions import scipy_extension
 
 
 @cache
 def _controller() -> Any:
-    import scipy.linalg.cython_blas  # noqa: F401 - loads the library that is to be found
     from threadpoolctl import ThreadpoolController
 
+    scipy_extension("linalg.cython_blas")  # loads the library that is to be found
     return ThreadpoolController().select(user_api="blas")
 
 
