@@ -17,7 +17,6 @@ def open_source(
 
     Args:
         folder: EuRoC or TUM-VI folder, map folder, or bag; None = the options' bag.
-        options: Kind of the recording.
         source: Calibration, cameras and topics.
 
     Raises:

@@ -54,7 +54,6 @@ class Mapping:
 
         Args:
             recording: Recording with an IMU.
-            options: See there.
             observer: Told of every frame.
             make_starter: See `Odometry`.
             on_estimate: Told of every frame before the map is built, as publishers of poses are.

@@ -57,7 +57,6 @@ class Odometry:
 
         Args:
             device: The sensors, with an IMU.
-            options: See there.
             make_starter: Makes what finds the first state, for drivers that know it from elsewhere;
                 None = the state is found from images and samples.
             map_rule: How observations of a map are weighed when the smoother is given some; None =

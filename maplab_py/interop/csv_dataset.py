@@ -117,7 +117,6 @@ def export_csv_dataset(
 
     Args:
         folder: Output folder; created if it does not exist.
-        missions: Mission rows; None = all.
         projector: Write projected descriptors instead of their bytes; None = bytes.
 
     Raises:

@@ -44,7 +44,6 @@ def vertex_states(
     """Collect the states of vertices.
 
     Args:
-        missions: Mission rows; None = all.
         reference_sensor_id: Sensor or camera of the poses; empty = each mission's IMU.
         at_imu_times: States at every IMU sample between the vertices: cubic position (which uses
             the velocities), rotation along the great arc, velocity and biases linear.

@@ -19,7 +19,7 @@ from maplab_py.algorithms.landmarks.options import LandmarkQualityOptions
 from maplab_py.algorithms.landmarks.quality import evaluate_quality
 from maplab_py.algorithms.loop_closure.features import PlaceIndex, ProjectionMemory, SearchScope
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.algorithms.loop_closure.workflow import close_loops, find_loop_closures
+from maplab_py.algorithms.loop_closure.workflow import close_loops, search_loops
 from maplab_py.algorithms.pose_graph_manipulation.layout import LayoutOptions, distribute_missions
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.relaxation import relax
@@ -366,7 +366,7 @@ class Merger:
             closed, report = close_loops(vi_map, self._loops, progress=progress)
             if not _has_large_gap(report.merges_refused):
                 return closed, ""
-            edges, _ = find_loop_closures(vi_map, self._loops, progress=progress)
+            edges = search_loops(vi_map, self._loops, progress=progress)[0].edges
             relaxed, _ = relax(vi_map, RelaxationOptions(), loop_closures=edges, progress=progress)
             return close_loops(relaxed, self._loops, progress=progress)[0], ""
         except EstimationError as error:

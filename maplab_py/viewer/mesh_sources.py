@@ -97,7 +97,6 @@ def field_slice(
     """Return the voxels at a height in G, coloured by their distances.
 
     Args:
-        missions: Rows of missions; None = all.
         height_m: Height; None = the median of the vertices.
 
     Raises:

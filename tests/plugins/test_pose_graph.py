@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import yaml
 
-from maplab_py.algorithms.loop_closure.workflow import find_loop_closures
+from maplab_py.algorithms.loop_closure.workflow import search_loops
 from maplab_py.console.session.session import Session
 from maplab_py.errors import FlagError, MapError, UserError
 from maplab_py.geometry import se3
@@ -30,7 +30,7 @@ def pose(T: np.ndarray) -> dict[str, list[float]]:
 def external(session: Session, path: Path, late_ns: int = 0) -> int:
     """Write the closures that lc would find, seen from poses a little beside the vertices."""
     vi_map = session.vi_map
-    edges, _ = find_loop_closures(vi_map)
+    edges = search_loops(vi_map)[0].edges
     beside = se3.make([0.0, 0.0, 0.1, np.sqrt(0.99)], [0.3, 0.1, -0.2])
     entries = []
     for a, b, T_A_B in zip(edges.from_vertex, edges.to_vertex, edges.T_A_B, strict=True):

@@ -204,8 +204,7 @@ class Judgement:
     @functools.cached_property
     def is_far(self) -> Mask:
         """Closures (N,) inside a mission that correct more than it can have drifted."""
-        drift_m = _DRIFT_OFFSET_M + self.options.max_drift_ratio * self.values.between_m
-        return np.asarray(self.values.correction_m > drift_m)
+        return correction_gates(self.values, self.options)[0].failed
 
     @functools.cached_property
     def paired(self) -> mission_alignment.LocatedClosures:

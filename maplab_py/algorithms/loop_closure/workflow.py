@@ -101,21 +101,6 @@ def search_loops(
     return LoopSearch(detection.closures, edges), report
 
 
-def find_loop_closures(
-    vi_map: VIMap,
-    options: LoopClosureOptions = _DEFAULT,
-    *,
-    progress: Progress = SILENT,
-) -> tuple[LoopClosureEdges, LoopClosureReport]:
-    """Find loop closures and return them as edges from query to place, for the pose graph.
-
-    Raises:
-        EstimationError: No descriptors, or too few tracks to learn their projection.
-    """
-    search, report = search_loops(vi_map, options, progress=progress)
-    return search.edges, report
-
-
 def insert_edges(
     vi_map: VIMap,
     options: LoopClosureOptions = _DEFAULT,

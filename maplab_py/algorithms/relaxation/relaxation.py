@@ -12,7 +12,7 @@ False closures are detected by graduated non-convexity and a test of each (see `
 `closure_consistency`), or down-weighted robustly (switchable constraints: Suenderhauf and
 Protzel, IROS 2012; dynamic covariance scaling: Agarwal et al., ICRA 2013).
 
-Use: `find_loop_closures` of `algorithms.loop_closure` gives the edges for `loop_closures`; those are
+Use: `search_loops` of `algorithms.loop_closure` gives the edges for `loop_closures`; those are
 constraints of this call only and are not added to the map. The map's own loop-closure edges always
 count and stay in the map, with the verdict in their switch variables.
 """

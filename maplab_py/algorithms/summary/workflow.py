@@ -15,7 +15,7 @@ from maplab_py.algorithms.landmarks.quality import evaluate_quality
 from maplab_py.algorithms.landmarks.tracks import init_tracks
 from maplab_py.algorithms.landmarks.triangulation import retriangulate
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.algorithms.loop_closure.workflow import close_loops, find_loop_closures
+from maplab_py.algorithms.loop_closure.workflow import close_loops, search_loops
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.relaxation import relax
 from maplab_py.algorithms.sparsification.options import SparsificationOptions
@@ -110,10 +110,10 @@ def _anchored(vi_map: VIMap, loops: LoopClosureOptions, progress: Progress) -> t
 
 
 def _relax(vi_map: VIMap, loops: LoopClosureOptions, progress: Progress) -> tuple[VIMap, Report]:
-    edges, search_report = find_loop_closures(vi_map, loops, progress=progress)
-    if len(edges) == 0:
+    search, search_report = search_loops(vi_map, loops, progress=progress)
+    if len(search.edges) == 0:
         return vi_map, search_report
-    return relax(vi_map, RelaxationOptions(), loop_closures=edges, progress=progress)
+    return relax(vi_map, RelaxationOptions(), loop_closures=search.edges, progress=progress)
 
 
 def _sparsify(vi_map: VIMap, options: WorkflowOptions, progress: Progress) -> tuple[VIMap, Report]:

@@ -110,7 +110,6 @@ class OnlineLocalization:
         Args:
             searched: The map.
             device: Sensors of the recording.
-            options: How it is localised.
             window: Of the odometry.
             features: Descriptors of images that are matched; empty = those that the tracks are to get.
         """

@@ -46,9 +46,6 @@ def add_poses_to_bag(
     Messages of the bag are copied byte by byte, and the format stays. With several missions the names of
     frames and topics end in _0, _1, ... by the time of their beginning.
 
-    Args:
-        missions: Rows; None = all.
-
     Raises:
         UserError: The source is no bag, the target exists, or there is nothing to add.
         MapError: The source is damaged.

@@ -70,7 +70,6 @@ def follow(
         second: Image in which they are sought.
         uv: Keypoints (K, 2).
         predicted_uv: Where they are expected (K, 2).
-        options: Parameters.
         is_near: Keypoints (K,) that are expected within a few pixels: lower levels will do for them.
 
     Returns:

@@ -64,7 +64,6 @@ def tracked_images_of(
         previous: What this function returned for the frames before; None = they are the first.
         T_I_C: Their poses (C, 7) on the IMU.
         R_I0_I1: Turn (3, 3) of the IMU since the previous frames, None = unknown.
-        options: Thresholds of the two-point RANSAC.
     """
     start, options = time.perf_counter(), options or TrackingOptions()
     poses = np.asarray(T_I_C, dtype=np.float64).reshape(-1, 7)

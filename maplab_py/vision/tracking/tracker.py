@@ -67,7 +67,6 @@ class FrameTracker:
 
         Args:
             T_I_C: Their poses (C, 7) on the IMU.
-            options: Parameters.
 
         Raises:
             UserError: A mask cannot be used.

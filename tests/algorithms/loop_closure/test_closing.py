@@ -11,7 +11,6 @@ from maplab_py.algorithms.loop_closure.merging import Votes, compare_landmarks, 
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.workflow import (
     close_loops,
-    find_loop_closures,
     insert_edges,
     search_loops,
 )
@@ -35,7 +34,8 @@ def relative_errors(truth, edges):
 
 def test_a_place_seen_twice_gives_true_edges():
     vi_map, truth = make_map(TWICE)
-    edges, report = find_loop_closures(vi_map)
+    search, report = search_loops(vi_map)
+    edges = search.edges
     assert report.failure == ""
     assert report.accepted_vertices >= 22
     position, turn_deg = relative_errors(truth, edges)
@@ -139,17 +139,16 @@ def test_edges_are_added_to_those_of_the_map_but_none_twice():
 
 def test_small_gaps_get_edges_unless_the_flag_forbids():
     vi_map, _ = make_map(TWICE)
-    edges, report = find_loop_closures(vi_map, LoopClosureOptions(edge_min_distance_meters=1.0))
+    search, report = search_loops(vi_map, LoopClosureOptions(edge_min_distance_meters=1.0))
+    edges = search.edges
     assert len(edges) == 0
     assert "--lc_edge_min_distance_meters=1" in report.failure
 
 
 def test_covariance_scaler_and_switch_variance_reach_the_edges():
     vi_map, _ = make_map(TWICE)
-    plain, _ = find_loop_closures(vi_map, LoopClosureOptions())
-    scaled, _ = find_loop_closures(
-        vi_map, LoopClosureOptions(edge_covariance_scaler=4.0, switch_variable_variance=0.5)
-    )
+    other = LoopClosureOptions(edge_covariance_scaler=4.0, switch_variable_variance=0.5)
+    plain, scaled = (search_loops(vi_map, o)[0].edges for o in (LoopClosureOptions(), other))
     np.testing.assert_allclose(scaled.covariance, 4.0 * plain.covariance)
     assert np.all(scaled.switch_variable_variance == 0.5)
     assert np.all(scaled.switch_variable == 1.0)
@@ -182,7 +181,7 @@ def test_stricter_gates_refuse():
         ({"min_support": 1000}, "no closures nearby agree"),
     ):
         options = dataclasses.replace(LoopClosureOptions(), **gate)
-        _, report = find_loop_closures(vi_map, options)
+        _, report = search_loops(vi_map, options)
         assert report.accepted == 0
         assert reason in report.refused
         assert reason in report.reason

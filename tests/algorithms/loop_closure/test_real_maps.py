@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from maplab_py.algorithms.loop_closure.workflow import find_loop_closures, search_loops
+from maplab_py.algorithms.loop_closure.workflow import search_loops
 from maplab_py.geometry import se3, so3
 from maplab_py.vimap import VIMap
 from tests.algorithms.loop_closure.against_truth import score, sessions
@@ -22,7 +22,8 @@ def load(relative: str) -> VIMap:
 def test_closures_of_the_flight_agree_with_ground_truth():
     submaps = [load(f"euroc_v1_01/euroc_v1_01_submap_{i}") for i in range(8)]
     vi_map, _ = append_submaps(submaps)
-    edges, report = find_loop_closures(vi_map)
+    search, report = search_loops(vi_map)
+    edges = search.edges
     assert report.accepted_vertices >= 90
     time_s, truth, valid = ground_truth_poses(vi_map)
     position = truth[:, 4:]
