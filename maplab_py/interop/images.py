@@ -180,6 +180,7 @@ def _whole_size(name: str, data: bytes, end: bytes) -> tuple[int, int]:
     """Return width and height of a PNG or JPEG image; more may follow its end: padding, or a short video."""
     from PIL import Image
 
+    Image.MAX_IMAGE_PIXELS = None  # nothing is decoded here
     stream, size, place = io.BytesIO(data), (0, 0), 0
     try:
         with Image.open(stream, formats=("PNG", "JPEG")) as image:
