@@ -46,6 +46,9 @@ from maplab_py.vimap import VIMap, mission_mask, to_hex
 _DEFAULT = AnchoringOptions()
 _ABSOLUTE = AbsoluteAnchoringOptions()
 _LOOPS = LoopClosureOptions()
+_NOTHING_KNOWN = (
+    "no mission has a known base frame to anchor to; choose one with set_mission_baseframe_to_known"
+)
 
 
 def anchor_missions(
@@ -81,89 +84,50 @@ def anchor_missions(
     wanted = mission_mask(vi_map, missions) & ~known
     vi_map, measured, refused = anchor_by_absolute_poses(vi_map, wanted, absolute)
     by_poses = tuple(names[i] for i in np.flatnonzero(measured))
-    refusals = tuple(f"{names[i]}: {reason}" for i, reason in refused.items())
-    already_known = tuple(names[i] for i in np.flatnonzero(known))
+    report = AnchoringReport(
+        already_known=tuple(names[i] for i in np.flatnonzero(known)),
+        anchored=by_poses,
+        not_anchored={},
+        alignments=(),
+        by_absolute_poses=by_poses,
+        notes=tuple(f"{names[i]}: {reason}" for i, reason in refused.items()),
+    )
     known, wanted = known | measured, wanted & ~measured
     if not known.any() or not wanted.any():
-        return vi_map, _nothing_to_do(already_known, by_poses, refusals, known, wanted)
+        idle = () if wanted.any() or by_poses else ("all base frames are known already",)
+        reason = "" if known.any() else _NOTHING_KNOWN
+        return vi_map, dataclasses.replace(report, notes=report.notes or idle, reason=reason)
     if options.hypothesis:
         choice = ambiguity.AlignmentChoice(options.hypothesis)
     judged, notes = evaluate_unknown_quality(vi_map, progress)
-    detection = _between_missions(judged, loop_options, choice, projections, progress)
-    T_G_M, reached, pairs = _align(
-        yaw.from_pose(vi_map.T_G_M),
-        known,
-        _sightings(judged, detection),
-        {c.pair.missions: c.reason for c in detection.contests if c.winner < 0},
-        options,
-        names,
-    )
-    used = [p.sightings for p in pairs if p.verdict == USED and reached[p.a] and reached[p.b]]
-    if used:
-        T_G_M = fit_missions(PairedClosures.concatenate(used), T_G_M, known | ~reached)
-    alignments = [_describe(pair, names) for pair in pairs]
-    anchored = reached & wanted
-    report = AnchoringReport(
-        already_known=already_known,
-        anchored=(*by_poses, *(names[i] for i in np.flatnonzero(anchored))),
-        by_absolute_poses=by_poses,
-        not_anchored={
-            names[i]: _why_not(i, names, alignments, judged, detection, loop_options)
-            for i in np.flatnonzero(wanted & ~reached)
-        },
-        alignments=tuple(alignments),
-        hypotheses=described_hypotheses(detection.contests, names),
-        notes=(*refusals, *notes),
-    )
-    if not anchored.any():
-        return vi_map, report
-    result = _with_base_frames(vi_map, anchored, T_G_M[anchored])
-    return record_updates.with_closures(result, detection.closures, "anchor"), report
-
-
-def _between_missions(
-    vi_map: VIMap,
-    options: LoopClosureOptions,
-    choice: ambiguity.AlignmentChoice | None,
-    projections: features.ProjectionMemory | None,
-    progress: Progress,
-) -> Detection:
-    return detect(
-        vi_map,
-        options,
-        missions=np.arange(len(vi_map.missions)),
+    detection = detect(
+        judged,
+        loop_options,
+        missions=np.arange(len(judged.missions)),
         only_other_missions=True,
         trust_base_frames=False,
         choice=choice,
         scope=features.SearchScope(projections=projections),
         progress=progress,
     )
-
-
-def _nothing_to_do(
-    already_known: tuple[str, ...],
-    by_poses: tuple[str, ...],
-    refusals: tuple[str, ...],
-    known: NDArray[np.bool_],
-    wanted: NDArray[np.bool_],
-) -> AnchoringReport:
-    """Report what absolute poses did where places have nothing to anchor, or nothing to anchor to."""
-    reason = ""
-    if not known.any():
-        reason = (
-            "no mission has a known base frame to anchor to; choose one with "
-            "set_mission_baseframe_to_known"
-        )
-    return AnchoringReport(
-        already_known=already_known,
-        anchored=by_poses,
-        not_anchored={},
-        alignments=(),
-        by_absolute_poses=by_poses,
-        notes=refusals
-        or (() if wanted.any() or by_poses else ("all base frames are known already",)),
-        reason=reason,
+    T_G_M, reached, pairs = _align(judged, known, detection, options, names)
+    alignments = [_describe(pair, names) for pair in pairs]
+    anchored = reached & wanted
+    report = dataclasses.replace(
+        report,
+        anchored=(*by_poses, *(names[i] for i in np.flatnonzero(anchored))),
+        not_anchored={
+            names[i]: _why_not(i, names, alignments, judged, detection, loop_options)
+            for i in np.flatnonzero(wanted & ~reached)
+        },
+        alignments=tuple(alignments),
+        hypotheses=described_hypotheses(detection.contests, names),
+        notes=(*report.notes, *notes),
     )
+    if not anchored.any():
+        return vi_map, report
+    result = _with_base_frames(vi_map, anchored, T_G_M[anchored])
+    return record_updates.with_closures(result, detection.closures, "anchor"), report
 
 
 def _describe(pair: Pair, names: list[str]) -> MissionAlignment:
@@ -187,23 +151,27 @@ def _sightings(vi_map: VIMap, detection: Detection) -> PairedClosures:
 
 
 def _align(
-    T_G_M: F64,
+    vi_map: VIMap,
     known: NDArray[np.bool_],
-    sightings: PairedClosures,
-    undecided: dict[tuple[int, int], str],
+    detection: Detection,
     options: AnchoringOptions,
     names: list[str],
 ) -> tuple[F64, NDArray[np.bool_], list[Pair]]:
-    """Align the strongest pairs and grow the tree; align all pairs if a mission is not reached."""
+    """Align the strongest pairs, grow the tree, and fit; align all pairs if a mission is not reached."""
+    start, sightings = yaw.from_pose(vi_map.T_G_M), _sightings(vi_map, detection)
+    undecided = {c.pair.missions: c.reason for c in detection.contests if c.winner < 0}
     wanted = strongest_pairs(sightings, len(known))
     pairs = align_pairs(sightings, undecided, options, wanted)
-    T, reached, pairs = _spread(T_G_M, known, consistent(pairs, options, names), options)
+    T_G_M, reached, pairs = _spread(start, known, consistent(pairs, options, names), options)
     joined = np.unique(np.concatenate([sightings.mission_A, sightings.mission_B]))
     is_complete = len(wanted) == len(sightings.rows_of_pairs())
-    if is_complete or reached[joined].all():
-        return T, reached, pairs
-    pairs = consistent(align_pairs(sightings, undecided, options), options, names)
-    return _spread(T_G_M, known, pairs, options)
+    if not (is_complete or reached[joined].all()):
+        pairs = consistent(align_pairs(sightings, undecided, options), options, names)
+        T_G_M, reached, pairs = _spread(start, known, pairs, options)
+    used = [p.sightings for p in pairs if p.verdict == USED and reached[p.a] and reached[p.b]]
+    if used:
+        T_G_M = fit_missions(PairedClosures.concatenate(used), T_G_M, known | ~reached)
+    return T_G_M, reached, pairs
 
 
 def _spread(

@@ -21,7 +21,7 @@ from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
 from maplab_py.errors import MapError
 from maplab_py.storage import extension_fields
 from maplab_py.vimap import IdIndex, VIMap, to_hex_list
-from maplab_py.vimap.table import Table, column
+from maplab_py.vimap.table import Table, column, object_column
 
 FIELD_NUMBER = extension_fields.LOOP_RECORD
 """Field number in the mission message."""
@@ -143,7 +143,7 @@ def write_record(vi_map: VIMap, record: LoopRecord) -> VIMap:
     # pairs belong to the closure that supports them
     owner = IdIndex(record.closures.id).rows(record.pairs.closure)
     pairs = np.append(closures, 0)[owner]
-    unknown = vi_map.missions.unknown.copy()
+    contents = []
     for row in range(len(vi_map.missions)):
         part = LoopRecord(
             record.closures.take(closures == row),
@@ -151,17 +151,19 @@ def write_record(vi_map: VIMap, record: LoopRecord) -> VIMap:
             record.keypoints.take(keypoints == row),
             record.pairs.take(pairs == row),
         )
-        content = None if part.is_empty else _encode(part)
-        unknown[row] = extension_fields.with_extension(unknown[row], FIELD_NUMBER, content)
-    return vi_map.replace(missions=vi_map.missions.replace(unknown=unknown))
+        contents.append(None if part.is_empty else _encode(part))
+    return _with_contents(vi_map, contents)
 
 
 def drop_record(vi_map: VIMap) -> VIMap:
     """Return the map without a record, a damaged one included."""
-    unknown = vi_map.missions.unknown.copy()
-    for row in range(len(unknown)):
-        unknown[row] = extension_fields.with_extension(unknown[row], FIELD_NUMBER, None)
-    return vi_map.replace(missions=vi_map.missions.replace(unknown=unknown))
+    return _with_contents(vi_map, [None] * len(vi_map.missions))
+
+
+def _with_contents(vi_map: VIMap, contents: list[bytes | None]) -> VIMap:
+    fields = zip(vi_map.missions.unknown, contents, strict=True)
+    unknown = [extension_fields.with_extension(old, FIELD_NUMBER, new) for old, new in fields]
+    return vi_map.replace(missions=vi_map.missions.replace(unknown=object_column(unknown)))
 
 
 def _encode(record: LoopRecord) -> bytes:
