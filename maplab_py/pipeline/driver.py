@@ -359,7 +359,11 @@ def run_pipeline(
     settings = RunSettings(
         options, results_folder.absolute(), Path.cwd(), dict(flags or {}), keep_going, discard
     )
-    engine = engines.engine_of(options)
+    engine = engines.Engine()
+    if options.scheduler != "none":
+        from maplab_py.pipeline.cluster import Cluster
+
+        engine = Cluster(options)
     driver = Driver(placed, settings, engine, watcher)
     with engine:
         if engine.address:

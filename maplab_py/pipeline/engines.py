@@ -1,10 +1,9 @@
-"""Execution of orders: in this process one after another, or on the workers of Dask."""
+"""Execution of orders, here in this process one after another."""
 
 from collections import deque
 from typing import Self
 
 from maplab_py.pipeline import execution, messages
-from maplab_py.pipeline.options import PipelineOptions
 
 
 class Engine:
@@ -46,16 +45,3 @@ class Engine:
 
     def __exit__(self, *_: object) -> None:
         """Stop all orders and everything that was started."""
-
-
-def engine_of(options: PipelineOptions) -> Engine:
-    """Return the engine that `--scheduler` asks for.
-
-    Raises:
-        UserError: Dask is not installed.
-    """
-    if options.scheduler == "none":
-        return Engine()
-    from maplab_py.pipeline.cluster import Cluster
-
-    return Cluster(options)
