@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -98,6 +99,14 @@ def test_predicted_work_is_that_of_a_dense_elimination(name: str) -> None:
     order = np.random.default_rng(5).permutation(pattern.num_nodes)
     below = 3.0 * _dense_columns(pattern, order)
     assert graph.work(order, 3) == pytest.approx(np.sum(9.0 + 9.0 * below + 3.0 * below**2))
+
+
+def test_another_scipy_gives_the_same_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    pattern, _ = _sessions_on_a_loop(2, 40)
+    order = minimum_degree(pattern)
+    moved = SimpleNamespace(gstrf=lambda *_, **__: len(None))  # raises TypeError
+    monkeypatch.setattr(ordering, "scipy_extension", lambda name: moved)
+    np.testing.assert_array_equal(minimum_degree(pattern), order)
 
 
 def test_work_of_groups_is_that_of_their_nodes() -> None:
