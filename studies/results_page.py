@@ -9,14 +9,7 @@ from maplab_py.output_files import write_text
 from studies import published
 from studies.data_sets import Row, lines_of
 from studies.published import THESIS, kind_of
-from studies.thesis_tables import (
-    BATCH,
-    CLASS_ROOM,
-    FILTER,
-    METHODS,
-    OFFICE_ROOM,
-    PAPER_III_METHODS,
-)
+from studies.thesis_tables import BATCH, CLASS_ROOM, FILTER, METHODS, OFFICE_ROOM, PAPER_III_METHODS
 
 _ANSWER = (
     "For the selection of segments yes: with eight informative ones errors of odometry are those with all "

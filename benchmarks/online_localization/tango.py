@@ -12,13 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.online_localization.euroc import scrambled_start
-from benchmarks.online_localization.modes import (
-    MODES,
-    Comparison,
-    PoseErrors,
-    compare,
-    pose_errors,
-)
+from benchmarks.online_localization.modes import MODES, Comparison, PoseErrors, compare, pose_errors
 from maplab_py.algorithms.keyframing.options import KeyframingOptions
 from maplab_py.algorithms.summary.workflow import WorkflowOptions, make_localization_map
 from maplab_py.array_types import F64, I64

@@ -52,15 +52,7 @@ def main() -> None:
 
 
 def _measure(what: str, seeds: list[int]) -> Iterator[Any]:
-    from benchmarks.places import (
-        aliased,
-        alike,
-        ambiguity,
-        euroc,
-        scrambled,
-        simulated,
-        tango,
-    )
+    from benchmarks.places import aliased, alike, ambiguity, euroc, scrambled, simulated, tango
 
     whole: dict[str, Callable[[], Iterator[Any]]] = {
         "pairs": tango.measure_pairs,

@@ -9,12 +9,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from benchmarks.places.aliased import (
-    farthest_m,
-    merges_of_strangers,
-    wrong_closures,
-    wrong_merges,
-)
+from benchmarks.places.aliased import farthest_m, merges_of_strangers, wrong_closures, wrong_merges
 from maplab_py.algorithms.anchoring.anchoring import anchor_missions
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.workflow import close_loops

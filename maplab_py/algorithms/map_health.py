@@ -18,13 +18,7 @@ from maplab_py.algorithms.loop_closure import closure_record, listing
 from maplab_py.algorithms.loop_closure.closure_table import VERDICTS
 from maplab_py.algorithms.loop_closure.reports import Verdict as ClosureVerdict
 from maplab_py.algorithms.recording_check.doctor import map_findings
-from maplab_py.algorithms.recording_check.findings import (
-    Check,
-    Finding,
-    Verdict,
-    cause,
-    remedies,
-)
+from maplab_py.algorithms.recording_check.findings import Check, Finding, Verdict, cause, remedies
 from maplab_py.algorithms.scale_check import mission_scales
 from maplab_py.array_types import F64
 from maplab_py.estimation.imu.inertial_data import InertialData

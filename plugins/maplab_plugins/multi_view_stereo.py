@@ -5,13 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from maplab_py.plugin import (
-    ALL_MISSIONS,
-    CommandContext,
-    MissionChoice,
-    UserError,
-    command,
-)
+from maplab_py.plugin import ALL_MISSIONS, CommandContext, MissionChoice, UserError, command
 
 if TYPE_CHECKING:
     from maplab_py.algorithms.dense.export import MvsExport

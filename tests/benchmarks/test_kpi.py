@@ -7,14 +7,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import kpi
-from benchmarks.kpi import (
-    PAGE,
-    Change,
-    regressions,
-    stored_releases,
-    table,
-    write_page,
-)
+from benchmarks.kpi import PAGE, Change, regressions, stored_releases, table, write_page
 
 
 @pytest.mark.parametrize(

@@ -17,12 +17,7 @@ from maplab_py.frontend.odometry_update import OdometryUpdate
 from maplab_py.frontend.starting import Start
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.recordings.map_replay import MapRecording
-from maplab_py.interop.recordings.protocol import (
-    Event,
-    ImuBatch,
-    RecordedSensors,
-    TrackedFrameSet,
-)
+from maplab_py.interop.recordings.protocol import Event, ImuBatch, RecordedSensors, TrackedFrameSet
 from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.simulation.scenario import MotionOptions
 from maplab_py.vimap.nav_state import NavState

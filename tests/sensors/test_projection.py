@@ -9,12 +9,7 @@ import pytest
 from maplab_py.errors import MapError
 from maplab_py.sensors import Camera, Distortion, Projection
 from maplab_py.sensors.camera import CAMERA_MODELS
-from maplab_py.sensors.projection import (
-    back_project,
-    is_inside_image,
-    project,
-    visibility_limits,
-)
+from maplab_py.sensors.projection import back_project, is_inside_image, project, visibility_limits
 
 INTRINSICS = {
     Projection.PINHOLE: [458.65, 457.30, 367.22, 248.38],

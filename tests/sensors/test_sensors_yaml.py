@@ -10,21 +10,9 @@ import yaml
 
 from maplab_py.errors import MapError
 from maplab_py.geometry import se3, so3
-from maplab_py.sensors import (
-    Camera,
-    CameraRig,
-    Distortion,
-    Imu,
-    OtherSensor,
-    Projection,
-    SensorSet,
-)
+from maplab_py.sensors import Camera, CameraRig, Distortion, Imu, OtherSensor, Projection, SensorSet
 from maplab_py.sensors.camera import CAMERA_MODELS, DISTORTION_SIZE, INTRINSICS_SIZE
-from maplab_py.sensors.sensors_yaml import (
-    parse_sensors,
-    read_sensors,
-    write_sensors,
-)
+from maplab_py.sensors.sensors_yaml import parse_sensors, read_sensors, write_sensors
 from maplab_py.sensors.wheels import wheel_scale, with_wheel_scale
 from maplab_py.sensors.yaml_text import dump_yaml, parse_yaml
 from tests.support.data import shared_data

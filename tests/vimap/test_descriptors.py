@@ -16,12 +16,7 @@ from maplab_py.interop.csv_dataset import CsvExportOptions, export_csv_dataset
 from maplab_py.storage.native import load_map, save_map
 from maplab_py.vimap import VIMap, edits, merge, tables
 from maplab_py.vimap.consistency import check_consistency
-from maplab_py.vimap.descriptors import (
-    DescriptorBlock,
-    binary_blocks,
-    no_blocks,
-    types_of,
-)
+from maplab_py.vimap.descriptors import DescriptorBlock, binary_blocks, no_blocks, types_of
 from maplab_py.vimap.table import object_column
 from tests.support import descriptor_blocks as by_hand
 from tests.support.data import shared_data

@@ -32,10 +32,7 @@ from maplab_py.algorithms.anchoring.pairs import (
 from maplab_py.algorithms.landmarks.quality import evaluate_unknown_quality
 from maplab_py.algorithms.loop_closure import ambiguity, features, record_updates, workflow
 from maplab_py.algorithms.loop_closure.detection import Detection, detect
-from maplab_py.algorithms.loop_closure.mission_alignment import (
-    PairedClosures,
-    ordered_by_mission,
-)
+from maplab_py.algorithms.loop_closure.mission_alignment import PairedClosures, ordered_by_mission
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.array_types import F64, I64, NDArray
 from maplab_py.errors import UserError

@@ -17,13 +17,7 @@ from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.array_types import I32, I64, Mask, Rows
 from maplab_py.distinct import distinct
 from maplab_py.memory import require_memory
-from maplab_py.vimap import (
-    Groups,
-    VIMap,
-    observation_matrix,
-    ragged_rows,
-    starts_of_counts,
-)
+from maplab_py.vimap import Groups, VIMap, observation_matrix, ragged_rows, starts_of_counts
 
 MIN_SHARED_LANDMARKS = 5
 """Number of common landmarks above which vertices belong to the same place."""

@@ -13,12 +13,7 @@ from maplab_py.algorithms.recording_check.hand_eye import (
     fit_rates,
 )
 from maplab_py.algorithms.recording_check.signals import Signals
-from maplab_py.algorithms.recording_check.turns import (
-    GyroTurns,
-    ImageTurns,
-    RayPairs,
-    image_turns,
-)
+from maplab_py.algorithms.recording_check.turns import GyroTurns, ImageTurns, RayPairs, image_turns
 from maplab_py.array_types import F64
 from maplab_py.geometry import so3
 

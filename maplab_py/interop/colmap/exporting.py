@@ -20,11 +20,7 @@ from maplab_py.interop.colmap.pycolmap_files import DATABASE
 from maplab_py.output_files import check_writable, copy_file, write_bytes
 from maplab_py.sensors import Camera, projection
 from maplab_py.vimap import LandmarkQuality, MissionSensor, VIMap, edits, from_hex, is_valid
-from maplab_py.vimap.descriptors import (
-    type_name,
-    type_of_name,
-    types_of,
-)
+from maplab_py.vimap.descriptors import type_name, type_of_name, types_of
 from maplab_py.vimap.queries import is_metric, mission_labels, mission_sensor_id
 from maplab_py.vimap.table import ragged_rows
 

@@ -8,14 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from maplab_plugins.visualization.following import NAME, running_viewer, viewer_for_output
 from maplab_py.cancellation import current_token, lasting_effect
-from maplab_py.plugin import (
-    CommandContext,
-    Message,
-    Report,
-    UserError,
-    check_writable,
-    command,
-)
+from maplab_py.plugin import CommandContext, Message, Report, UserError, check_writable, command
 
 if TYPE_CHECKING:
     from maplab_py.viewer.display.viewer import Viewer

@@ -15,11 +15,7 @@ from maplab_py.console.session.session import Session
 from maplab_py.errors import UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.ply import parse_ply
-from maplab_py.interop.resources.depth_maps import (
-    RAW_DEPTH_MAPS,
-    encoded_depth,
-    import_depth_maps,
-)
+from maplab_py.interop.resources.depth_maps import RAW_DEPTH_MAPS, encoded_depth, import_depth_maps
 from maplab_py.sensors.projection import back_project
 from maplab_py.storage.resources.new import NewResources
 from maplab_py.vimap import VIMap, edits, resources_of, without_resources

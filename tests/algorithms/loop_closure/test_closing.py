@@ -9,11 +9,7 @@ from maplab_py.algorithms.landmarks.keypoint_rays import landmark_covariance
 from maplab_py.algorithms.loop_closure import merging
 from maplab_py.algorithms.loop_closure.merging import Votes, compare_landmarks, unite
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
-from maplab_py.algorithms.loop_closure.workflow import (
-    close_loops,
-    insert_edges,
-    search_loops,
-)
+from maplab_py.algorithms.loop_closure.workflow import close_loops, insert_edges, search_loops
 from maplab_py.errors import EstimationError
 from maplab_py.geometry import se3, so3
 from maplab_py.sensors.projection import project

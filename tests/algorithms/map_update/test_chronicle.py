@@ -12,11 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.landmarks.evidence import (
-    LANDMARK_EVIDENCE,
-    read_evidence,
-    with_evidence,
-)
+from maplab_py.algorithms.landmarks.evidence import LANDMARK_EVIDENCE, read_evidence, with_evidence
 from maplab_py.algorithms.map_update import chronicle
 from maplab_py.algorithms.map_update.options import UpdateOptions
 from maplab_py.algorithms.map_update.update import update_map

@@ -9,11 +9,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from maplab_py.algorithms.relaxation.graph_files import (
-    graph_of_map,
-    is_odometry,
-    map_of_graph,
-)
+from maplab_py.algorithms.relaxation.graph_files import graph_of_map, is_odometry, map_of_graph
 from maplab_py.algorithms.relaxation.options import RelaxationOptions
 from maplab_py.algorithms.relaxation.relaxation import relax
 from maplab_py.geometry import se3, so3

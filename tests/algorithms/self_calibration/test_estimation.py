@@ -6,10 +6,7 @@ import numpy as np
 import pytest
 
 from maplab_py.algorithms.self_calibration import calibration as module
-from maplab_py.algorithms.self_calibration.calibration import (
-    calibrate,
-    partitions_without_scale,
-)
+from maplab_py.algorithms.self_calibration.calibration import calibrate, partitions_without_scale
 from maplab_py.algorithms.self_calibration.estimation.imu_interpolation import (
     correct_interpolation_bias,
 )

@@ -10,11 +10,7 @@ from hypothesis import strategies as st
 from prompt_toolkit.completion import CompleteEvent
 from prompt_toolkit.document import Document
 
-from maplab_py.algorithms.loop_closure.closure_record import (
-    ClosureRecord,
-    LoopRecord,
-    write_record,
-)
+from maplab_py.algorithms.loop_closure.closure_record import ClosureRecord, LoopRecord, write_record
 from maplab_py.console.commands.command import describe
 from maplab_py.console.commands.registry import Plugin, load_registry
 from maplab_py.console.prompt.completion import complete, match_rank

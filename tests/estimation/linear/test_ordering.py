@@ -11,11 +11,7 @@ from scipy.linalg import cho_factor, cho_solve
 from maplab_py.array_types import F64
 from maplab_py.errors import FlagError
 from maplab_py.estimation.linear import nested_dissection, ordering, protocol, quotient_graph
-from maplab_py.estimation.linear.conjugate_gradients import (
-    CGResult,
-    Operator,
-    conjugate_gradients,
-)
+from maplab_py.estimation.linear.conjugate_gradients import CGResult, Operator, conjugate_gradients
 from maplab_py.estimation.linear.nested_dissection import dissect_by_position, has_metis
 from maplab_py.estimation.linear.ordering import (
     Ordering,

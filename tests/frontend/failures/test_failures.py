@@ -12,12 +12,7 @@ from maplab_py.estimation.window.frame import ImuPart
 from maplab_py.frontend.failures.images import ImageWatch
 from maplab_py.frontend.failures.motion import pose_by_rays
 from maplab_py.frontend.failures.samples import SampleWatch
-from maplab_py.frontend.failures.watch import (
-    SensorFailure,
-    SensorWatch,
-    replace_failed,
-    replaced,
-)
+from maplab_py.frontend.failures.watch import SensorFailure, SensorWatch, replace_failed, replaced
 from maplab_py.frontend.imu_buffer import ImuInterval
 from maplab_py.frontend.mapping import Mapping
 from maplab_py.frontend.odometry_options import OdometryOptions

@@ -11,12 +11,7 @@ from maplab_py.frontend.initialization.initializer import Initializer
 from maplab_py.geometry import so3
 from maplab_py.interop.recordings.map_replay import MapRecording
 from maplab_py.interop.recordings.options import SourceOptions
-from maplab_py.interop.recordings.protocol import (
-    FrameSet,
-    ImuBatch,
-    Recording,
-    TrackedFrameSet,
-)
+from maplab_py.interop.recordings.protocol import FrameSet, ImuBatch, Recording, TrackedFrameSet
 from maplab_py.interop.recordings.reader_choice import open_recording
 from maplab_py.interop.recordings.stream import EventStream
 from maplab_py.interop.trajectories import read_trajectory

@@ -9,11 +9,7 @@ import pytest
 from maplab_py.errors import MapError, MaplabError, UserError
 from maplab_py.geometry import se3, so3
 from maplab_py.interop.calibration_export import exported
-from maplab_py.interop.calibration_import import (
-    device_of,
-    import_calibration,
-    read_calibration,
-)
+from maplab_py.interop.calibration_import import device_of, import_calibration, read_calibration
 from maplab_py.interop.device import DeviceOptions, RecordedSensors, make_device
 from maplab_py.interop.recordings.options import SourceOptions
 from maplab_py.interop.recordings.reader_choice import open_recording

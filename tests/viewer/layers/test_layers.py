@@ -25,15 +25,7 @@ from maplab_py.viewer.layers.covariances import ABSOLUTE_POSES, LOOP_CLOSURES, e
 from maplab_py.viewer.layers.coverage import SeenVolume, _crossings, next_walks, seen_volume
 from maplab_py.viewer.options import VisualizationOptions
 from maplab_py.viewer.picking import pick
-from maplab_py.viewer.scene import (
-    WHOLE_MAP,
-    Entity,
-    Layer,
-    Mesh,
-    Points,
-    Scene,
-    Segments,
-)
+from maplab_py.viewer.scene import WHOLE_MAP, Entity, Layer, Mesh, Points, Scene, Segments
 from maplab_py.vimap import AbsolutePoses, LoopClosureEdges, VIMap
 from maplab_py.vimap.merge import merge_maps
 from tests.algorithms.loop_closure.rooms import Walk, make_map
