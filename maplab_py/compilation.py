@@ -13,8 +13,6 @@ A module with kernels, or the module that calls them, has a function `compile_ke
 kernels once with small arguments of the types that commands use. `maplab_py.warmup` calls all of them.
 """
 
-from __future__ import annotations
-
 import enum
 import hashlib
 import os

@@ -1,7 +1,5 @@
 """The user's cache folder. Code in it is executed, so only the user may write to it."""
 
-from __future__ import annotations
-
 import atexit
 import logging
 import os

@@ -3,8 +3,6 @@
 `compilation` imports this module, after it has set the processor, and nothing else does.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from operator import attrgetter
 from typing import Any

@@ -1,7 +1,5 @@
 """Self-calibration beside a run: segments whose states are final go to a process of low priority."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import queue

@@ -1,7 +1,5 @@
 """Estimate alignments of pairs of missions and test them by their closures and by cycles."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

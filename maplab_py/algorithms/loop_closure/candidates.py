@@ -5,8 +5,6 @@ the vertices that share landmarks with it form a place (Sattler 2015: covisibili
 Places of each mission are verified separately because only a single mission is rigid.
 """
 
-from __future__ import annotations
-
 import itertools
 from typing import Any
 

@@ -6,8 +6,6 @@ closures with several of them: it counts once for each. Support is counted in st
 trajectories (`stretches`), because an alignment is a statement about both missions.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from typing import Any

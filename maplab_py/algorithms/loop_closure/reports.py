@@ -1,7 +1,5 @@
 """Verdicts on loop closures, and the reports of the commands that find, list and remove them."""
 
-from __future__ import annotations
-
 import dataclasses
 from enum import Enum
 from typing import Any

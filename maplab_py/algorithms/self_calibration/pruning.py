@@ -1,7 +1,5 @@
 """Removal of segments from a database: of missions, beyond a capacity, or of a device that changed."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Sequence
 

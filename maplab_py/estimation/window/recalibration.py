@@ -5,8 +5,6 @@ other states follow from both. Biases change such that corrected samples stay th
 is transformed to the new states, and inflated where the old calibration may have distorted it.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Self
 

@@ -1,7 +1,5 @@
 """Export maps as COLMAP models, with a database of keypoints, descriptors and matches."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 import tempfile

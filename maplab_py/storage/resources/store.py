@@ -1,7 +1,5 @@
 """Resource files of a map: paths, cached loading, copying."""
 
-from __future__ import annotations
-
 import dataclasses
 import shutil
 import threading

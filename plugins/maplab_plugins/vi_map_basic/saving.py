@@ -1,7 +1,5 @@
 """Saving maps to disk."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 from typing import Any
