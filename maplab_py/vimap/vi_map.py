@@ -12,23 +12,8 @@ from maplab_py.array_types import F64, NDArray
 from maplab_py.geometry import se3
 from maplab_py.report import counted, to_html
 from maplab_py.sensors import SensorSet
-from maplab_py.vimap import descriptors, ids, staged_folder
+from maplab_py.vimap import descriptors, ids, staged_folder, tables
 from maplab_py.vimap.table import starts_of_counts
-from maplab_py.vimap.tables import (
-    AbsolutePoses,
-    BaseFrames,
-    Frames,
-    ImuEdges,
-    ImuSamples,
-    Keypoints,
-    LandmarkQuality,
-    Landmarks,
-    LoopClosureEdges,
-    Missions,
-    Resources,
-    TransformationEdges,
-    Vertices,
-)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -67,7 +52,7 @@ class LandmarkView:
     vertex: int  # row of the vertex that stores it
     p_I: F64  # (3,) in that vertex' body frame [m]
     p_G: F64  # (3,) [m]
-    quality: LandmarkQuality
+    quality: tables.LandmarkQuality
     keypoints: NDArray[np.int64]  # rows of its observations
 
 
@@ -112,7 +97,7 @@ def landmark_view(vi_map: VIMap, row: int) -> LandmarkView:
         vertex=int(table.vertex[row]),
         p_I=table.p_I[row],
         p_G=vi_map.p_G[row],
-        quality=LandmarkQuality(int(table.quality[row])),
+        quality=tables.LandmarkQuality(int(table.quality[row])),
         keypoints=vi_map.observations[start[row] : start[row + 1]],
     )
 
@@ -141,20 +126,24 @@ class VIMap:
 
     sensors: SensorSet = dataclasses.field(default_factory=SensorSet)
     metadata: MapMetadata = dataclasses.field(default_factory=MapMetadata)
-    missions: Missions = dataclasses.field(default_factory=Missions.empty)
-    baseframes: BaseFrames = dataclasses.field(default_factory=BaseFrames.empty)
-    vertices: Vertices = dataclasses.field(default_factory=Vertices.empty)
-    frames: Frames = dataclasses.field(default_factory=Frames.empty)
-    keypoints: Keypoints = dataclasses.field(default_factory=Keypoints.empty)
-    landmarks: Landmarks = dataclasses.field(default_factory=Landmarks.empty)
-    imu_edges: ImuEdges = dataclasses.field(default_factory=ImuEdges.empty)
-    imu_samples: ImuSamples = dataclasses.field(default_factory=ImuSamples.empty)
-    transformation_edges: TransformationEdges = dataclasses.field(
-        default_factory=TransformationEdges.empty
+    missions: tables.Missions = dataclasses.field(default_factory=tables.Missions.empty)
+    baseframes: tables.BaseFrames = dataclasses.field(default_factory=tables.BaseFrames.empty)
+    vertices: tables.Vertices = dataclasses.field(default_factory=tables.Vertices.empty)
+    frames: tables.Frames = dataclasses.field(default_factory=tables.Frames.empty)
+    keypoints: tables.Keypoints = dataclasses.field(default_factory=tables.Keypoints.empty)
+    landmarks: tables.Landmarks = dataclasses.field(default_factory=tables.Landmarks.empty)
+    imu_edges: tables.ImuEdges = dataclasses.field(default_factory=tables.ImuEdges.empty)
+    imu_samples: tables.ImuSamples = dataclasses.field(default_factory=tables.ImuSamples.empty)
+    transformation_edges: tables.TransformationEdges = dataclasses.field(
+        default_factory=tables.TransformationEdges.empty
     )
-    loop_closure_edges: LoopClosureEdges = dataclasses.field(default_factory=LoopClosureEdges.empty)
-    absolute_poses: AbsolutePoses = dataclasses.field(default_factory=AbsolutePoses.empty)
-    resources: Resources = dataclasses.field(default_factory=Resources.empty)
+    loop_closure_edges: tables.LoopClosureEdges = dataclasses.field(
+        default_factory=tables.LoopClosureEdges.empty
+    )
+    absolute_poses: tables.AbsolutePoses = dataclasses.field(
+        default_factory=tables.AbsolutePoses.empty
+    )
+    resources: tables.Resources = dataclasses.field(default_factory=tables.Resources.empty)
 
     def __repr__(self) -> str:
         """Return the content of the map in one line."""
@@ -296,5 +285,5 @@ class VIMap:
 
     def nbytes(self) -> int:
         """Return the memory of all tables in bytes (shared columns counted once each)."""
-        tables = (getattr(self, field.name) for field in dataclasses.fields(self))
-        return sum(table.nbytes() for table in tables if hasattr(table, "nbytes"))
+        values = (getattr(self, field.name) for field in dataclasses.fields(self))
+        return sum(value.nbytes() for value in values if hasattr(value, "nbytes"))

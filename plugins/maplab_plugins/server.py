@@ -15,10 +15,17 @@ from maplab_py.server import options as server_options
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from maplab_py.server.spool import Spool
     from maplab_py.server.submap_sources import RecordedSession
     from maplab_py.vimap import VIMap
 
 _SECONDS_BETWEEN_LOOKS = 0.2
+
+
+def _spool(folder: Path) -> Spool:
+    from maplab_py.server.spool import Spool
+
+    return Spool(folder)
 
 
 @command(
@@ -51,11 +58,10 @@ def serve(
         serve_visualize_map: Show the published map in the viewer, one colour a robot.
     """
     from maplab_py.server.server import MapServer
-    from maplab_py.server.spool import Spool
 
     watch, shown_at = _shown(context) if serve_visualize_map else (None, "")
     map_server = MapServer(
-        Spool(spool),
+        _spool(spool),
         server,
         stationary=stationary,
         incremental=incremental,
@@ -108,10 +114,9 @@ def serve_status(
         wait_s: Wait up to so long [s] until a server has merged all that can be merged.
     """
     from maplab_py.server.client import NotRunning, ask
-    from maplab_py.server.spool import Spool
     from maplab_py.server.status import status_without_server
 
-    folder, deadline = Spool(spool), time.monotonic() + wait_s
+    folder, deadline = _spool(spool), time.monotonic() + wait_s
     while True:
         try:
             content = ask(folder, "serve_status")
@@ -144,9 +149,8 @@ def serve_stop(context: CommandContext, *, spool: Path, wait_s: float = 0.0) -> 
         wait_s: Wait up to so long [s] for its end.
     """
     from maplab_py.server.client import order
-    from maplab_py.server.spool import Spool
 
-    folder, deadline = Spool(spool), time.monotonic() + wait_s
+    folder, deadline = _spool(spool), time.monotonic() + wait_s
     order(folder, "serve_stop")
     while folder.address.exists() and time.monotonic() < deadline:
         context.progress.check()
@@ -214,10 +218,9 @@ def map_lookup(
         p_S: Point in the frame of the sensor, "x y z" in metres.
     """
     from maplab_py.server.client import ask
-    from maplab_py.server.spool import Spool
 
     content = ask(
-        Spool(spool),
+        _spool(spool),
         "map_lookup",
         robot_name=robot_name,
         timestamp_ns=str(timestamp_ns),
@@ -258,10 +261,9 @@ def get_dense_map_in_range(
 
     from maplab_py.interop.ply import PlyCloud, write_ply
     from maplab_py.server.client import ask
-    from maplab_py.server.spool import Spool
 
     given = {"center_G": center_G, "radius_m": repr(radius_m)}
-    content = ask(Spool(spool), "get_dense_map_in_range", **given)
+    content = ask(_spool(spool), "get_dense_map_in_range", **given)
     points = np.array(content["p_G"], dtype=np.float64).reshape(-1, 3)
     if output_file is not None:
         write_ply(PlyCloud(points), output_file, overwrite=overwrite)
@@ -294,11 +296,10 @@ def simulate_robots(
         maps_folder: Play the maps below this folder instead, as rovioli makes them of recordings; each
             mission is a robot, named after it or after the folder of its map.
     """
-    from maplab_py.server.spool import Spool
     from maplab_py.server.submap_sources import play as play_submaps
     from maplab_py.server.submap_sources import recorded_sessions, timed_submaps
 
-    folder = Spool(spool)
+    folder = _spool(spool)
     truth = folder.root / "truth.npz" if maps_folder is None else None
     sessions: Mapping[str, VIMap | RecordedSession]
     if maps_folder is not None:
@@ -344,9 +345,8 @@ def _shown(context: CommandContext) -> tuple[Callable[[VIMap], None], str]:
 
 def _delete(spool: Path, name: str, **parameters: str) -> server_options.DeletedMissions:
     from maplab_py.server.client import order
-    from maplab_py.server.spool import Spool
 
-    content = order(Spool(spool), name, **parameters)
+    content = order(_spool(spool), name, **parameters)
     return server_options.DeletedMissions(tuple(content["missions"]), content["vertices"])
 
 

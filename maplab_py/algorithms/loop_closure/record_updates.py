@@ -4,17 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from maplab_py.algorithms.loop_closure import closure_table, consensus, merging
-from maplab_py.algorithms.loop_closure.closure_record import (
-    USES,
-    ClosureRecord,
-    LoopRecord,
-    MergedKeypoints,
-    MergedLandmarks,
-    MergePairs,
-    read_record,
-    write_record,
-)
+from maplab_py.algorithms.loop_closure import closure_record, closure_table, consensus, merging
 from maplab_py.algorithms.loop_closure.options import LoopClosureOptions
 from maplab_py.algorithms.loop_closure.reports import ClosureRemovalReport, Verdict
 from maplab_py.array_types import F64, I64, Mask, mask_of
@@ -31,7 +21,7 @@ _BAN_REACH_M = 2.0
 
 def banned(vi_map: VIMap, query_vertex: I64, place_vertex: I64) -> Mask:
     """Return which candidates (N,) a user has removed, in either direction."""
-    closures = read_record(vi_map).closures
+    closures = closure_record.read_record(vi_map).closures
     closures = closures.take(closures.verdict == REMOVED)
     result = np.zeros(len(query_vertex), dtype=np.bool_)
     a, b = (vi_map.vertex_index.rows(ids) for ids in (closures.query, closures.place))
@@ -72,29 +62,33 @@ def with_closures(
         merges: Merges that the closures support.
         before: The map before merging.
     """
-    old = read_record(vi_map)
+    old = closure_record.read_record(vi_map)
     new = _closure_rows(vi_map, closures, use, used, weight)
     again = IdIndex(new.id).rows(old.closures.id)
-    lasting = np.isin(old.closures.use, (USES.index("merge"), USES.index("edge")))
+    lasting = np.isin(
+        old.closures.use, (closure_record.USES.index("merge"), closure_record.USES.index("edge"))
+    )
     use_column = new.use.copy()
     is_known = (again >= 0) & lasting
     use_column[again[is_known]] = old.closures.use[is_known]
     kept = (again < 0) & (lasting | (old.closures.verdict == REMOVED))
-    table = ClosureRecord.concatenate([old.closures.take(kept), new.replace(use=use_column)])
+    table = closure_record.ClosureRecord.concatenate(
+        [old.closures.take(kept), new.replace(use=use_column)]
+    )
     record = dataclasses.replace(old, closures=table)
     if merges is not None and before is not None:
         record = _with_merges(record, before, closures, merges)
-    return write_record(vi_map, record)
+    return closure_record.write_record(vi_map, record)
 
 
 def _closure_rows(
     vi_map: VIMap, c: closure_table.Closures, use: str, used: Mask | None, weight: F64 | None
-) -> ClosureRecord:
+) -> closure_record.ClosureRecord:
     served = c.accepted if used is None else used
     with np.errstate(invalid="ignore"):
         sigma = np.sqrt(np.einsum("nii->ni", c.covariance))
     _, first = np.unique(c.id, axis=0, return_index=True)  # two places may share their vertex
-    return ClosureRecord.filled(
+    return closure_record.ClosureRecord.filled(
         len(c),
         id=c.id,
         query=vi_map.vertices.id[c.query_vertex],
@@ -105,18 +99,21 @@ def _closure_rows(
             field.name: getattr(c, field.name)
             for field in dataclasses.fields(closure_table.GateValues)
         },
-        use=np.where(served, USES.index(use), 0),
+        use=np.where(served, closure_record.USES.index(use), 0),
         weight=np.ones(len(c)) if weight is None else weight,
     ).take(np.sort(first))
 
 
 def _with_merges(
-    record: LoopRecord, before: VIMap, closures: closure_table.Closures, merges: merging.MergeResult
-) -> LoopRecord:
+    record: closure_record.LoopRecord,
+    before: VIMap,
+    closures: closure_table.Closures,
+    merges: merging.MergeResult,
+) -> closure_record.LoopRecord:
     """Append the pairs, the landmarks before merging, and the keypoints that observed them."""
     lm = before.landmarks
     touched = distinct(np.concatenate([merges.first, merges.second]))
-    landmarks = MergedLandmarks(
+    landmarks = closure_record.MergedLandmarks(
         id=lm.id[touched],
         vertex=before.vertices.id[lm.vertex[touched]],
         p_I=lm.p_I[touched],
@@ -125,12 +122,12 @@ def _with_merges(
     )
     keypoint = np.flatnonzero(np.isin(before.keypoints.landmark, touched))
     frame = before.keypoint_frame[keypoint]
-    keypoints = MergedKeypoints(
+    keypoints = closure_record.MergedKeypoints(
         frame=before.frames.id[frame],
         index=keypoint - before.keypoint_start[frame],
         landmark=lm.id[before.keypoints.landmark[keypoint]],
     )
-    pairs = MergePairs.filled(
+    pairs = closure_record.MergePairs.filled(
         len(merges.closure),
         first=lm.id[merges.first],
         second=lm.id[merges.second],
@@ -139,9 +136,9 @@ def _with_merges(
     )
     return dataclasses.replace(
         record,
-        landmarks=MergedLandmarks.concatenate([record.landmarks, landmarks]),
-        keypoints=MergedKeypoints.concatenate([record.keypoints, keypoints]),
-        pairs=MergePairs.concatenate([record.pairs, pairs]),
+        landmarks=closure_record.MergedLandmarks.concatenate([record.landmarks, landmarks]),
+        keypoints=closure_record.MergedKeypoints.concatenate([record.keypoints, keypoints]),
+        pairs=closure_record.MergePairs.concatenate([record.pairs, pairs]),
     )
 
 
@@ -155,9 +152,9 @@ def remove_closures(vi_map: VIMap, ids: IdArray) -> tuple[VIMap, ClosureRemovalR
     Args:
         ids: Ids (N, 2) of closures in the record.
     """
-    record = read_record(vi_map)
+    record = closure_record.read_record(vi_map)
     removed = IdIndex(ids).rows(record.closures.id) >= 0
-    relaxed = removed & (record.closures.use == USES.index("relax"))
+    relaxed = removed & (record.closures.use == closure_record.USES.index("relax"))
     verdict = np.where(removed, REMOVED, record.closures.verdict)
     closures = record.closures.replace(
         verdict=verdict, use=np.where(removed, 0, record.closures.use)
@@ -166,7 +163,9 @@ def remove_closures(vi_map: VIMap, ids: IdArray) -> tuple[VIMap, ClosureRemovalR
     result = edits.remove_loop_closure_edges(vi_map, edges) if edges.any() else vi_map
     pairs = record.pairs.take(IdIndex(ids).rows(record.pairs.closure) < 0)
     result, restored, moved, pairs = _restore(result, record, _still_wanted(pairs, record.closures))
-    result = write_record(result, dataclasses.replace(record, closures=closures, pairs=pairs))
+    result = closure_record.write_record(
+        result, dataclasses.replace(record, closures=closures, pairs=pairs)
+    )
     notes = []
     if relaxed.any():
         notes.append("the trajectories keep their relaxed poses: run relax again")
@@ -188,7 +187,7 @@ def accept_closures(vi_map: VIMap, ids: IdArray, options: LoopClosureOptions) ->
     Raises:
         UserError: The pose of a closure was not determined.
     """
-    record = read_record(vi_map)
+    record = closure_record.read_record(vi_map)
     c = record.closures
     chosen = (IdIndex(ids).rows(c.id) >= 0) & (
         c.verdict != closure_table.VERDICTS.index(Verdict.ACCEPTED)
@@ -206,14 +205,16 @@ def accept_closures(vi_map: VIMap, ids: IdArray, options: LoopClosureOptions) ->
     kept = old.take(IdIndex(new.id).rows(old.id) < 0)
     closures = c.replace(
         verdict=np.where(chosen, closure_table.VERDICTS.index(Verdict.ACCEPTED), c.verdict),
-        use=np.where(chosen, USES.index("edge"), c.use),
+        use=np.where(chosen, closure_record.USES.index("edge"), c.use),
         weight=np.where(chosen, 1.0, c.weight),
     )
     result = vi_map.replace(loop_closure_edges=LoopClosureEdges.concatenate([kept, edges]))
-    return write_record(result, dataclasses.replace(record, closures=closures))
+    return closure_record.write_record(result, dataclasses.replace(record, closures=closures))
 
 
-def _still_wanted(pairs: MergePairs, closures: ClosureRecord) -> MergePairs:
+def _still_wanted(
+    pairs: closure_record.MergePairs, closures: closure_record.ClosureRecord
+) -> closure_record.MergePairs:
     """Return the pairs that closures of enough query vertices support."""
     count = len(pairs)
     if count == 0:
@@ -229,14 +230,14 @@ def _still_wanted(pairs: MergePairs, closures: ClosureRecord) -> MergePairs:
     return pairs.take(votes[pair] >= pairs.wanted)
 
 
-def _groups(landmarks: IdIndex, count: int, pairs: MergePairs) -> I64:
+def _groups(landmarks: IdIndex, count: int, pairs: closure_record.MergePairs) -> I64:
     """Label recorded landmarks (count,) by connected component of the pairs."""
     return connected_groups(landmarks.rows(pairs.first), landmarks.rows(pairs.second), count)
 
 
 def _restore(
-    vi_map: VIMap, record: LoopRecord, pairs: MergePairs
-) -> tuple[VIMap, int, int, MergePairs]:
+    vi_map: VIMap, record: closure_record.LoopRecord, pairs: closure_record.MergePairs
+) -> tuple[VIMap, int, int, closure_record.MergePairs]:
     """Split merged landmarks into the groups that the remaining pairs connect."""
     lm = _first_of_each(record.landmarks)
     index = IdIndex(lm.id)
@@ -276,7 +277,9 @@ def _restore(
     return result, len(back), int(np.count_nonzero(moves)), pairs
 
 
-def _as_before(vi_map: VIMap, recorded: MergedLandmarks, rows: I64, vertex: I64) -> VIMap:
+def _as_before(
+    vi_map: VIMap, recorded: closure_record.MergedLandmarks, rows: I64, vertex: I64
+) -> VIMap:
     """Give landmarks that lost all they were merged with their recorded position and quality.
 
     Args:
@@ -293,13 +296,15 @@ def _as_before(vi_map: VIMap, recorded: MergedLandmarks, rows: I64, vertex: I64)
     return moved.replace(landmarks=table.put(landmarks, quality=recorded.quality[rows]))
 
 
-def _first_of_each(landmarks: MergedLandmarks) -> MergedLandmarks:
+def _first_of_each(landmarks: closure_record.MergedLandmarks) -> closure_record.MergedLandmarks:
     """Return one row per landmark, the oldest."""
     _, first = np.unique(landmarks.id, axis=0, return_index=True)
     return landmarks.take(np.sort(first))
 
 
-def _recorded_keypoints(vi_map: VIMap, record: LoopRecord, index: IdIndex) -> tuple[I64, I64]:
+def _recorded_keypoints(
+    vi_map: VIMap, record: closure_record.LoopRecord, index: IdIndex
+) -> tuple[I64, I64]:
     """Return existing keypoint rows and the recorded original landmark of each."""
     frame = IdIndex(vi_map.frames.id).rows(record.keypoints.frame)
     original = index.rows(record.keypoints.landmark)

@@ -15,16 +15,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, TextIO
 
 from maplab_py import cancellation, kernel_cache
-from maplab_py.console.terminal import drawing, foreground, layout, streams
-from maplab_py.console.terminal.render import (
-    render,
-    render_json,
-    render_json_error,
-    rendered,
-    text_with_names,
-    wants_colour,
-    with_names,
-)
+from maplab_py.console.terminal import drawing, foreground, layout, render, streams
 from maplab_py.errors import Cancelled, UserError
 from maplab_py.progress import Progress
 from maplab_py.report import Report
@@ -60,7 +51,7 @@ class TerminalProgress:
         self._stream = stream
         self._token = cancellation.current_token()
         self._what = what
-        self._is_live = wants_colour(stream)
+        self._is_live = render.wants_colour(stream)
         self._prints_lines = stream.isatty() or verbosity > 0
         self._start = time.monotonic()
         self._updated = 0.0
@@ -200,7 +191,7 @@ class ConsoleTerminal:
     @property
     def shows_progress(self) -> bool:
         """Tell whether bars are drawn."""
-        return wants_colour(sys.stderr)
+        return render.wants_colour(sys.stderr)
 
     @property
     def is_interactive(self) -> bool:
@@ -251,11 +242,11 @@ class ConsoleTerminal:
         self._hide_progress()
         with self._output() as out:
             if self.as_json:
-                render_json(report, command, seconds, out)
+                render.render_json(report, command, seconds, out)
             elif layout.blocks_of(report) and not self._page(report):
-                render(report, out, self.mission_names(), self.page_of_ids())
+                render.render(report, out, self.mission_names(), self.page_of_ids())
         if self._transcript is not None:
-            blocks = with_names(layout.blocks_of(report), self.mission_names())
+            blocks = render.with_names(layout.blocks_of(report), self.mission_names())
             self._copy("\n\n".join(drawing.plain_text(block) for block in blocks))
 
     def failed(self, text: str, command: str, status: int) -> None:
@@ -263,7 +254,7 @@ class ConsoleTerminal:
         self.clear_progress()
         if self.as_json:
             with self._output() as out:
-                render_json_error(text, command, status, out)
+                render.render_json_error(text, command, status, out)
         self.error(text)
 
     @contextmanager
@@ -304,13 +295,13 @@ class ConsoleTerminal:
 
     def advise(self, text: str) -> None:
         """Print one line on what to do next."""
-        line = text_with_names(f"next: {text}", self.mission_names())
+        line = render.text_with_names(f"next: {text}", self.mission_names())
         _write_line(sys.stdout, line, "\x1b[36m")
         self._copy(line)
 
     def error(self, text: str) -> None:
         """Print one line on standard error."""
-        text = text if self.as_json else text_with_names(text, self.mission_names())
+        text = text if self.as_json else render.text_with_names(text, self.mission_names())
         _write_line(sys.stderr, f"error: {text}", "\x1b[31m")
         self._copy(f"error: {text}")
 
@@ -361,7 +352,7 @@ class ConsoleTerminal:
     def _page(self, report: Report) -> bool:
         if not self.is_prompt or self._out is not None:
             return False
-        return page(rendered(report, sys.stdout, self.mission_names(), self.page_of_ids()))
+        return page(render.rendered(report, sys.stdout, self.mission_names(), self.page_of_ids()))
 
     def _hide_progress(self) -> None:
         for progress in self._progresses:
@@ -376,7 +367,7 @@ class ConsoleTerminal:
 def _write_line(stream: TextIO, text: str, colour: str) -> None:
     if stream.isatty():
         text = drawing.folded(text, shutil.get_terminal_size().columns)
-    line = f"{colour}{text}\x1b[0m" if wants_colour(stream) else text
+    line = f"{colour}{text}\x1b[0m" if render.wants_colour(stream) else text
     streams.write_message(stream, line)
 
 

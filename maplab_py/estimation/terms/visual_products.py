@@ -5,14 +5,7 @@ import dataclasses
 import numpy as np
 
 from maplab_py.array_types import F64
-from maplab_py.estimation.kernels.schur_products import (
-    KeptSystem,
-    PoseSums,
-    Structure,
-    eliminate_landmarks,
-    factor_landmarks,
-    multiply,
-)
+from maplab_py.estimation.kernels import schur_products
 from maplab_py.estimation.states import States
 from maplab_py.estimation.terms.visual import VisualTerms
 from maplab_py.memory import require_memory
@@ -49,14 +42,18 @@ class VisualProducts:
         needed += chunks * _BYTES_PER_VERTEX * vertices
         require_memory(float(needed), "the Jacobians of the reprojection errors")
         longest = int(np.diff(data.start).max(initial=0))
-        self._structure = Structure(data.start, data.vertex, visual.chunk_start, longest)
-        self._kept = KeptSystem(
+        self._structure = schur_products.Structure(
+            data.start, data.vertex, visual.chunk_start, longest
+        )
+        self._kept = schur_products.KeptSystem(
             np.zeros((len(data), _NUMBERS_KEPT), dtype=np.float32),
             np.zeros((landmarks, 6)),
             np.zeros((landmarks, 3)),
             np.zeros((landmarks, 6)),
         )
-        self._sums = PoseSums(np.zeros((chunks, vertices, 6, 6)), np.zeros((chunks, vertices, 6)))
+        self._sums = schur_products.PoseSums(
+            np.zeros((chunks, vertices, 6, 6)), np.zeros((chunks, vertices, 6))
+        )
         self._products = np.zeros((chunks, vertices, 6))
 
     def evaluate(self, states: States) -> tuple[PoseSystem, float]:
@@ -74,16 +71,20 @@ class VisualProducts:
         if not self._visual.moves_points:
             self._kept.landmark_factor.fill(0.0)
             return evaluated
-        factor_landmarks(self._kept.landmark_square, damping, self._kept.landmark_factor)
+        schur_products.factor_landmarks(
+            self._kept.landmark_square, damping, self._kept.landmark_factor
+        )
         self._clear()
-        eliminate_landmarks(self._structure, self._kept, *self._sums)
+        schur_products.eliminate_landmarks(self._structure, self._kept, *self._sums)
         change = self._sum_of_chunks()
         return PoseSystem(evaluated.blocks + change.blocks, evaluated.gradient + change.gradient)
 
     def multiply(self, x: F64) -> F64:
         """Return S x (V, 6) for steps x (V, 6) of the poses."""
         self._products.fill(0.0)
-        multiply(self._structure, self._kept, np.ascontiguousarray(x), self._products)
+        schur_products.multiply(
+            self._structure, self._kept, np.ascontiguousarray(x), self._products
+        )
         return np.asarray(self._products.sum(axis=0))
 
     def _clear(self) -> None:

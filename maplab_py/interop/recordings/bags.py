@@ -18,31 +18,7 @@ import numpy as np
 
 from maplab_py.errors import MapError, UserError
 from maplab_py.interop.images import CONTAINER_BITS, SAMPLES
-from maplab_py.interop.recordings.bag_files import (
-    ACCELEROMETER,
-    IMU,
-    TopicStream,
-    damage_named,
-    header_stamp_ns,
-    imu_sample,
-    opened_bag,
-    topic_in_bag,
-    topic_types,
-)
-from maplab_py.interop.recordings.clocks import (
-    ClockFilter,
-    ClockRestart,
-    Run,
-    check_common_time,
-    check_dropped,
-    check_part,
-    common_part_count,
-    dropped_note,
-    first_stamp_ns,
-    follows,
-    is_within,
-    restart_error,
-)
+from maplab_py.interop.recordings import bag_files, clocks
 from maplab_py.interop.recordings.images import bits_note, camera_bits, image_of_message
 from maplab_py.interop.recordings.options import ReadingOptions
 from maplab_py.interop.recordings.paired_imu import ACCEL, GYRO, PairedImu
@@ -95,7 +71,7 @@ class BagRecording:
         self._bits = [CONTAINER_BITS] * len(device.cameras)
         # width and height of the first image of cameras, where it can be read
         self.first_sizes_px: dict[int, tuple[int, int]] = {}
-        self._clocks: list[ClockFilter[Any]] = []
+        self._clocks: list[clocks.ClockFilter[Any]] = []
         self._is_apart = False
         topics = tuple(camera_topics) or tuple(camera.topic for camera in device.cameras)
         if len(topics) != len(device.cameras):
@@ -103,15 +79,19 @@ class BagRecording:
                 f"--camera_topics names {len(topics)} topics, {len(device.cameras)} cameras are read"
             )
         streams = [
-            TopicStream(topic, row, device.cameras[row].time_offset_ns)
+            bag_files.TopicStream(topic, row, device.cameras[row].time_offset_ns)
             for row, topic in enumerate(topics)
         ]
         if device.imu is not None:
-            named = zip(imu_topics or (device.imu.topic,), (IMU, ACCELEROMETER), strict=False)
-            streams = [*(TopicStream(topic, sensor) for topic, sensor in named), *streams]
+            named = zip(
+                imu_topics or (device.imu.topic,),
+                (bag_files.IMU, bag_files.ACCELEROMETER),
+                strict=False,
+            )
+            streams = [*(bag_files.TopicStream(topic, sensor) for topic, sensor in named), *streams]
         elif imu_topics:
             raise UserError(f"--imu_topic={','.join(imu_topics)}: the calibration has no IMU")
-        with opened_bag(self._path) as reader:
+        with bag_files.opened_bag(self._path) as reader:
             self.kind = f"ROS {2 if reader.is2 else 1} bag"
             self._arrivals_ns = reader.start_time, reader.end_time
             self._streams = [self._examined(reader, stream) for stream in streams]
@@ -125,7 +105,7 @@ class BagRecording:
         """Parts of the recording that are not read, and how the others are."""
         notes = [bits_note(c, bits) for c, bits in enumerate(self._bits) if bits < CONTAINER_BITS]
         notes += [
-            dropped_note(f"{self._path}: {stream.topic}", clock.dropped, clock.first)
+            clocks.dropped_note(f"{self._path}: {stream.topic}", clock.dropped, clock.first)
             for stream, clock in zip(self._streams, self._clocks, strict=False)
             if clock.dropped
         ]
@@ -163,14 +143,14 @@ class BagRecording:
                 max(run.last_ns for _, run in having),
             )
             images = sum(run.count for stream, run in having if stream.camera >= 0)
-            samples = sum(run.count for stream, run in having if stream.camera == IMU)
+            samples = sum(run.count for stream, run in having if stream.camera == bag_files.IMU)
             duration_s = (last_ns - first_ns) * 1e-9
             spans.append(PartSpan(part + 1, first_ns, duration_s, samples, images))
         return tuple(spans)
 
     def items(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Item]:
         """Yield images and the IMU samples between them; see `Recording.items`."""
-        with opened_bag(self._path) as reader:
+        with bag_files.opened_bag(self._path) as reader:
             yield from self._items(reader, start_ns, end_ns)
 
     def _items(self, reader: BagReader, start_ns: int | None, end_ns: int | None) -> Iterator[Item]:
@@ -178,13 +158,13 @@ class BagRecording:
         times_ns: list[int] = []
         samples: list[tuple[float, ...]] = []
         for time_ns, stream, message in self._in_order(reader, start_ns, end_ns):
-            if stream.camera == IMU:
+            if stream.camera == bag_files.IMU:
                 times_ns.append(time_ns)
                 samples.append(message)
-            if times_ns and (stream.camera != IMU or len(times_ns) == _LARGEST_BATCH):
+            if times_ns and (stream.camera != bag_files.IMU or len(times_ns) == _LARGEST_BATCH):
                 yield from self._batch(times_ns, samples)
                 times_ns, samples = [], []
-            if stream.camera != IMU:
+            if stream.camera != bag_files.IMU:
                 yield self._image(stream, time_ns, message, read_bits[stream.camera])
         if times_ns:
             yield from self._batch(times_ns, samples)
@@ -205,7 +185,7 @@ class BagRecording:
         return read
 
     def _images_at(
-        self, reader: BagReader, stream: TopicStream, places_ns: list[int]
+        self, reader: BagReader, stream: bag_files.TopicStream, places_ns: list[int]
     ) -> Iterator[CameraImage]:
         """Yield the first image of a camera after each of some times of arrival."""
         connections = [c for c in reader.connections if c.topic == stream.topic]
@@ -218,21 +198,21 @@ class BagRecording:
 
     def _in_order(
         self, reader: BagReader, start_ns: int | None, end_ns: int | None
-    ) -> Iterator[tuple[int, TopicStream, Any]]:
+    ) -> Iterator[tuple[int, bag_files.TopicStream, Any]]:
         """Yield time, stream and message in the order of time, the IMU's first among equals."""
         delays_ns = [stream.delay_ns for stream in self._streams]
         window_ns = max(delays_ns) - min(delays_ns) + _DELAY_MARGIN_NS
-        waiting: list[tuple[int, int, int, TopicStream, Any]] = []
+        waiting: list[tuple[int, int, int, bag_files.TopicStream, Any]] = []
         newest_ns = delivered_ns = -1
         number = itertools.count()
-        restart: ClockRestart | None = None
+        restart: clocks.ClockRestart | None = None
         messages = self._messages(reader, start_ns, end_ns)
         while True:
             try:
                 time_ns, stream, message = next(messages)
             except StopIteration:
                 break
-            except ClockRestart as error:
+            except clocks.ClockRestart as error:
                 restart = error
                 break
             if time_ns < delivered_ns:
@@ -253,28 +233,35 @@ class BagRecording:
 
     def _messages(
         self, reader: BagReader, start_ns: int | None, end_ns: int | None
-    ) -> Iterator[tuple[int, TopicStream, Any]]:
+    ) -> Iterator[tuple[int, bag_files.TopicStream, Any]]:
         """Yield time, stream and message in the order of arrival, accelerations with angular rates."""
         delays_ns = [stream.delay_ns for stream in self._streams]
         begin = None if start_ns is None else start_ns + min(delays_ns) - _SEEK_MARGIN_NS
         end = None if end_ns is None else end_ns + max(delays_ns) + _SEEK_MARGIN_NS
         self._clocks = [
-            ClockFilter(None if begin is not None else stream.first_ns) for stream in self._streams
+            clocks.ClockFilter(None if begin is not None else stream.first_ns)
+            for stream in self._streams
         ]
         rows = {s.topic: (s, clock) for s, clock in zip(self._streams, self._clocks, strict=True)}
         is_ros_2, has_stamps = reader.is2, not self._reading.use_arrival_time
-        joined = PairedImu(None) if any(s.camera == ACCELEROMETER for s in self._streams) else None
+        joined = (
+            PairedImu(None)
+            if any(s.camera == bag_files.ACCELEROMETER for s in self._streams)
+            else None
+        )
         connections = [c for c in reader.connections if c.topic in rows]
         for connection, arrival_ns, data in reader.messages(connections, begin, end):
             stream, clock = rows[connection.topic]
             bounds = stream.arrivals_ns
             if bounds is not None and not bounds[0] <= arrival_ns <= bounds[1]:
                 continue
-            stamp_ns = header_stamp_ns(data, is_ros_2=is_ros_2) if has_stamps else arrival_ns
+            stamp_ns = (
+                bag_files.header_stamp_ns(data, is_ros_2=is_ros_2) if has_stamps else arrival_ns
+            )
             is_image = stream.camera >= 0
             message: Any = connection.msgtype, data
             if not is_image:
-                message = imu_sample(data, is_ros_2=is_ros_2)
+                message = bag_files.imu_sample(data, is_ros_2=is_ros_2)
             time_ns = stamp_ns + stream.time_offset_ns
             if clock.passes(time_ns):
                 if joined is None and not is_image and start_ns is end_ns is None:  # most messages
@@ -287,16 +274,16 @@ class BagRecording:
                 if clock.part > part and clock.restart is not None:
                     if end_ns is not None and (clock.restart.before_ns or 0) >= end_ns:
                         return
-                    raise restart_error(f"{self._path}: {stream.topic}", clock.restart)
+                    raise clocks.restart_error(f"{self._path}: {stream.topic}", clock.restart)
             for time_ns, content in ready:
-                if not is_within(time_ns, start_ns, end_ns):
+                if not clocks.is_within(time_ns, start_ns, end_ns):
                     continue
                 if is_image:
                     yield time_ns, stream, reader.deserialize(content[1], content[0])
                 elif joined is None:
                     yield time_ns, stream, content
                 else:
-                    sensor = GYRO if stream.camera == IMU else ACCEL
+                    sensor = GYRO if stream.camera == bag_files.IMU else ACCEL
                     for joint_ns, sample in joined.add(sensor, time_ns, content):
                         yield joint_ns, self._streams[0], sample
         for stream, clock in zip(self._streams, self._clocks, strict=True):
@@ -305,8 +292,8 @@ class BagRecording:
 
     def _pushed(
         self,
-        stream: TopicStream,
-        clock: ClockFilter[Any],
+        stream: bag_files.TopicStream,
+        clock: clocks.ClockFilter[Any],
         stamp_ns: int,
         message: Any,
         span_ns: tuple[int | None, int | None],
@@ -314,7 +301,7 @@ class BagRecording:
         """Return the messages that are in line after one out of line; those left out of a span count."""
         dropped = clock.dropped
         ready = clock.push(stamp_ns + stream.time_offset_ns, message)
-        if clock.dropped > dropped and not is_within(stamp_ns, *span_ns):
+        if clock.dropped > dropped and not clocks.is_within(stamp_ns, *span_ns):
             clock.dropped = dropped
         elif clock.dropped > dropped:
             self._check_late(stream, clock)
@@ -322,10 +309,10 @@ class BagRecording:
 
     def _stamp_ns(self, data: bytes, arrival_ns: int, *, is_ros_2: bool) -> int:
         is_stamped = not self._reading.use_arrival_time
-        return header_stamp_ns(data, is_ros_2=is_ros_2) if is_stamped else arrival_ns
+        return bag_files.header_stamp_ns(data, is_ros_2=is_ros_2) if is_stamped else arrival_ns
 
-    def _check_late(self, stream: TopicStream, clock: ClockFilter[Any]) -> None:
-        check_dropped(
+    def _check_late(self, stream: bag_files.TopicStream, clock: clocks.ClockFilter[Any]) -> None:
+        clocks.check_dropped(
             f"{self._path}: {stream.topic}",
             clock.dropped,
             stream.count,
@@ -334,20 +321,22 @@ class BagRecording:
             "" if self._reading.use_arrival_time else "; --use_arrival_time takes those of arrival",
         )
 
-    def _runs(self) -> list[list[Run]]:
+    def _runs(self) -> list[list[clocks.Run]]:
         """Return the runs of each stream's clock; reads the stamps of the whole bag."""
         rows = {stream.topic: row for row, stream in enumerate(self._streams)}
-        clocks: list[ClockFilter[int]] = [ClockFilter(s.first_ns) for s in self._streams]
-        runs: list[list[Run]] = [[Run()] for _ in self._streams]
-        with opened_bag(self._path) as reader:
+        filters: list[clocks.ClockFilter[int]] = [
+            clocks.ClockFilter(s.first_ns) for s in self._streams
+        ]
+        runs: list[list[clocks.Run]] = [[clocks.Run()] for _ in self._streams]
+        with bag_files.opened_bag(self._path) as reader:
             connections = [c for c in reader.connections if c.topic in rows]
             for connection, arrival_ns, data in reader.messages(connections):
                 row = rows[connection.topic]
                 stamp_ns = self._stamp_ns(data, arrival_ns, is_ros_2=reader.is2)
                 time_ns = stamp_ns + self._streams[row].time_offset_ns
-                for ready_ns, ready_arrival_ns in clocks[row].push(time_ns, arrival_ns):
-                    if clocks[row].part == len(runs[row]):
-                        runs[row].append(Run())
+                for ready_ns, ready_arrival_ns in filters[row].push(time_ns, arrival_ns):
+                    if filters[row].part == len(runs[row]):
+                        runs[row].append(clocks.Run())
                     runs[row][-1].add(ready_ns, ready_arrival_ns)
         return runs
 
@@ -361,11 +350,11 @@ class BagRecording:
         runs = self._runs()
         counts = {s.camera: len(run) for s, run in zip(self._streams, runs, strict=True)}
         count = max(counts.values())
-        check_part(self.name, part, count)
+        clocks.check_part(self.name, part, count)
         sensors = [counts[s.camera] for s in self._streams if s.camera < 0]
         cameras = [counts[s.camera] for s in self._streams if s.camera >= 0]
         self._is_apart = part > 1 and min(counts.values()) < count
-        common_part_count(self.name, max(sensors, default=None), cameras)
+        clocks.common_part_count(self.name, max(sensors, default=None), cameras)
         divided = [of_stream for of_stream in runs if len(of_stream) == count]
         if part > 1:
             before_ns = max(of_stream[part - 2].last_arrival_ns for of_stream in divided)
@@ -373,7 +362,7 @@ class BagRecording:
         if part < count:
             after_ns = min(of_stream[part].first_arrival_ns for of_stream in divided)
             self._arrivals_ns = self._arrivals_ns[0], after_ns - 1
-        with opened_bag(self._path) as reader:
+        with bag_files.opened_bag(self._path) as reader:
             self._streams = [
                 stream.of_run(of_stream[part - 1])
                 if len(of_stream) == count
@@ -398,7 +387,7 @@ class BagRecording:
             imu, images = ((min(s)[0], max(end for _, end in s)) for s in spans_ns)
             delay_ns = self._streams[-1].delay_ns - self._streams[0].delay_ns
             shift_ns = self.device.cameras[-1].time_offset_ns + delay_ns
-            check_common_time(
+            clocks.check_common_time(
                 self.name,
                 imu,
                 images,
@@ -407,8 +396,11 @@ class BagRecording:
             )
 
     def _examined(
-        self, reader: BagReader, stream: TopicStream, within_ns: tuple[int, int] | None = None
-    ) -> TopicStream:
+        self,
+        reader: BagReader,
+        stream: bag_files.TopicStream,
+        within_ns: tuple[int, int] | None = None,
+    ) -> bag_files.TopicStream:
         """Return the stream with the bag's name of its topic and the times of its first message.
 
         Args:
@@ -417,8 +409,8 @@ class BagRecording:
         """
         sensor = f"camera {stream.camera}" if stream.camera >= 0 else "IMU"
         flag = "--camera_topics" if stream.camera >= 0 else "--imu_topic"
-        types = topic_types(reader)
-        topic = topic_in_bag(
+        types = bag_files.topic_types(reader)
+        topic = bag_files.topic_in_bag(
             self._path,
             types,
             stream.topic,
@@ -433,14 +425,14 @@ class BagRecording:
         messages = reader.messages(connections, begin_ns, end_ns)
         for _, at_ns, data in itertools.islice(messages, _EXAMINED):
             if stream.camera >= 0 and not stamps_ns:
-                with contextlib.suppress(MapError), damage_named(self._path):
+                with contextlib.suppress(MapError), bag_files.damage_named(self._path):
                     image = self._image(
                         stream, at_ns, reader.deserialize(data, types[topic]), CONTAINER_BITS
                     )
                     self.first_sizes_px[stream.camera] = image.data.size_px()
             arrivals_ns.append(at_ns)
             stamps_ns.append(self._stamp_ns(data, at_ns, is_ros_2=reader.is2))
-            if len(stamps_ns) > 1 and follows(*stamps_ns[-2:]):
+            if len(stamps_ns) > 1 and clocks.follows(*stamps_ns[-2:]):
                 break
         if not stamps_ns:
             raise MapError(f"{self._path}: the recording is empty: {topic} has no messages")
@@ -449,7 +441,7 @@ class BagRecording:
                 f"{self._path}: {topic}: the stamps of its messages are all 0, as of a driver that sets "
                 "none: give --use_arrival_time to take the times of arrival"
             )
-        stamp_ns = first_stamp_ns(stamps_ns)
+        stamp_ns = clocks.first_stamp_ns(stamps_ns)
         arrival_ns = arrivals_ns[stamps_ns.index(stamp_ns)]
         first_ns = stamp_ns + stream.time_offset_ns
         return dataclasses.replace(
@@ -473,7 +465,9 @@ class BagRecording:
         if is_number.any():
             yield ImuBatch.of(self.device.imu, times[is_number], values[is_number])
 
-    def _image(self, stream: TopicStream, time_ns: int, message: Any, bits: int) -> CameraImage:
+    def _image(
+        self, stream: bag_files.TopicStream, time_ns: int, message: Any, bits: int
+    ) -> CameraImage:
         stamp_ns = time_ns - stream.time_offset_ns
         name, camera = f"{self._path}: {stream.topic} at {stamp_ns}", stream.camera
         data = image_of_message(message, name, self.device.cameras[camera])

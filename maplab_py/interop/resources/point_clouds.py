@@ -10,14 +10,7 @@ import numpy as np
 from maplab_py.array_types import I64
 from maplab_py.errors import MapError, UserError, os_errors_as
 from maplab_py.input_files import DEFAULT_MAX_BYTES, read_bytes
-from maplab_py.interop.ply import (
-    INTENSITIES,
-    EmptyCloud,
-    PlyCloud,
-    cloud_of_table,
-    encode_ply,
-    parse_ply,
-)
+from maplab_py.interop import ply
 from maplab_py.interop.resources.matching import ImportedResources, stamped_files
 from maplab_py.progress import SILENT, Progress
 from maplab_py.report import counted
@@ -30,11 +23,11 @@ from maplab_py.vimap import MissionSensor, ResourceOwner, VIMap, from_hex, queri
 _TYPES = {"F": "f", "I": "i", "U": "u"}
 _MAX_HEADER_BYTES = 100_000
 _MAX_POINTS = 100_000_000
-_SINGLE = ("x", "y", "z", *INTENSITIES, "rgb", "rgba", "red", "green", "blue", "r", "g", "b")
+_SINGLE = ("x", "y", "z", *ply.INTENSITIES, "rgb", "rgba", "red", "green", "blue", "r", "g", "b")
 """Fields of one value."""
 
 
-def parse_pcd(data: bytes, source: str) -> PlyCloud:
+def parse_pcd(data: bytes, source: str) -> ply.PlyCloud:
     """Read the content of a PCD file (ascii or binary); points with NaN are left out.
 
     Raises:
@@ -72,7 +65,7 @@ def parse_pcd(data: bytes, source: str) -> PlyCloud:
             )
     except ValueError as error:
         raise MapError(f"{source}: the PCD data end early or do not fit ({error})") from None
-    cloud = cloud_of_table(table)
+    cloud = ply.cloud_of_table(table)
     return cloud.where(np.isfinite(cloud.p).all(axis=1))
 
 
@@ -155,7 +148,7 @@ def attach_clouds(
     mission: int,
     sensor_id: str,
     times_ns: I64,
-    read: Callable[[I64], Iterable[Callable[[], PlyCloud]]],
+    read: Callable[[I64], Iterable[Callable[[], ply.PlyCloud]]],
     source: str,
     remedy: str,
     progress: Progress,
@@ -187,16 +180,16 @@ def attach_clouds(
     chosen = np.flatnonzero(inside & ~np.isin(times_ns, table.timestamp_ns[known]))
     new = NewResources(seed=vi_map.missions.id[mission].tobytes())
     kept: list[int] = []
-    problem: EmptyCloud | None = None
+    problem: ply.EmptyCloud | None = None
     for row, load in zip(chosen.tolist(), read(chosen), strict=True):
         progress.step(len(kept), len(chosen), "point clouds")
         try:
             cloud = load()
-        except EmptyCloud as error:
+        except ply.EmptyCloud as error:
             problem = problem or error
             continue
         kind = XYZ if cloud.intensity is None else XYZI
-        new.add(kind if cloud.colours is None else XYZRGB, b"".join(encode_ply(cloud)))
+        new.add(kind if cloud.colours is None else XYZRGB, b"".join(ply.encode_ply(cloud)))
         kept.append(row)
     if problem is not None and not kept:
         raise problem
@@ -219,7 +212,7 @@ def attach_clouds(
     return vi_map, report, outside
 
 
-def read_cloud(path: Path) -> PlyCloud:
+def read_cloud(path: Path) -> ply.PlyCloud:
     """Read a PLY or PCD file.
 
     Raises:
@@ -227,12 +220,12 @@ def read_cloud(path: Path) -> PlyCloud:
     """
     with os_errors_as(MapError, f"{path}: the cloud cannot be read"):
         data = read_bytes(path, DEFAULT_MAX_BYTES, remedy="split it", error=MapError)
-    parse = parse_pcd if path.suffix.lower() == ".pcd" else parse_ply
+    parse = parse_pcd if path.suffix.lower() == ".pcd" else ply.parse_ply
     cloud = parse(data, str(path))
     valid = np.isfinite(cloud.p).all(axis=1)
     if not valid.any():
         problem = "is not finite" if len(cloud.p) else "is empty"
-        raise EmptyCloud(f"{path}: the cloud {problem}: remove the file, or export it again")
+        raise ply.EmptyCloud(f"{path}: the cloud {problem}: remove the file, or export it again")
     return cloud if valid.all() else cloud.where(valid)
 
 
