@@ -36,7 +36,6 @@ from maplab_py.simulation.ray_caster import painted_boxes
 from maplab_py.simulation.scenario import ImageOptions
 from maplab_py.simulation.scene import make_scene
 from maplab_py.storage import maplab_map_pb2 as pb
-from maplab_py.storage.protobuf.ids import LARGE_MESSAGE, ids_of_parts
 from maplab_py.storage.protobuf.scan import estimate
 from maplab_py.vimap.descriptors import FeatureType
 from maplab_py.vision import (
@@ -136,15 +135,15 @@ def _compile_dense() -> None:
 
 def _scan_message() -> None:
     """Compile the walk over the fields of a message and the reading of ids."""
-    from maplab_py.storage.protobuf.id_fields_kernel import landmark_columns, read_ids
+    from maplab_py.storage.protobuf import id_fields_kernel
 
     message = pb.VIMapMetadata()
     message.files.add(file_type=0, path="missions")
-    ids_of_parts(bytes(LARGE_MESSAGE), 10, (1, 2))
     begin = np.zeros(1, dtype=np.int64)
     data = np.frombuffer(bytes(1), dtype=np.uint8)
-    read_ids(data, begin[:0], begin[:0], 1, 0)
-    landmark_columns(data, begin[:0], begin[:0])
+    id_fields_kernel.parts_of_field(data, 1)
+    id_fields_kernel.read_ids(data, begin[:0], begin[:0], 1, 0)
+    id_fields_kernel.landmark_columns(data, begin[:0], begin[:0])
     estimate(message.SerializeToString(), pb.VIMapMetadata.DESCRIPTOR)  # type: ignore[arg-type]
 
 
