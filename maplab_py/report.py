@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import html
+import inspect
 import json
 from collections.abc import Mapping
 from enum import Enum
@@ -29,9 +30,10 @@ class Report:
         dataclasses.dataclass(frozen=True)(cls)
         # plugins may decorate their reports, too: the decorator must not see that this was done
         del cls.__setattr__, cls.__delattr__
-        for field in dataclasses.fields(cls):
-            if field.default_factory is not dataclasses.MISSING:
-                setattr(cls, field.name, field)
+        for name in inspect.get_annotations(cls):
+            field = cls.__dataclass_fields__.get(name)
+            if field is not None and field.default_factory is not dataclasses.MISSING:
+                setattr(cls, name, field)
 
     def __setattr__(self, name: str, value: object) -> None:
         raise dataclasses.FrozenInstanceError(f"cannot assign to field {name!r}")

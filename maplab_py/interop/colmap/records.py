@@ -6,6 +6,7 @@ what memory holds for the missing part, or never returns.
 
 import re
 import struct
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -37,7 +38,7 @@ _CUTS = {"images": 9, "points3D": 8}
 _T = TypeVar("_T")
 
 
-class _File:
+class _File(ABC):
     """A file that is read from its beginning to its end."""
 
     tolerance = np.inf  # of the length of quaternions
@@ -62,9 +63,9 @@ class _File:
         """Return the error that the file is damaged."""
         return MapError(f"{self.path}{self._line}: is damaged: {reason}; {REMEDY}")
 
+    @abstractmethod
     def doubles(self, count: int) -> F64:
         """Take numbers."""
-        raise NotImplementedError
 
 
 class _Binary(_File):

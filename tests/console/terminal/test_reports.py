@@ -375,7 +375,14 @@ def test_decorated_reports_of_plugins_are_the_same_dataclasses() -> None:
         note: str = "none"
         rows: list[int] = dataclasses.field(default_factory=list)
 
+    @dataclasses.dataclass(frozen=True)
+    class Longer(Decorated):
+        """A report of a report that has a value made anew for each."""
+
+        is_longer: bool = True
+
     assert Decorated(3).as_dict() == {"count": 3, "note": "none", "rows": []}
+    assert Longer(3).as_dict() == {"count": 3, "note": "none", "rows": [], "is_longer": True}
     assert Decorated(3) == Decorated(3, "none", [])
     with pytest.raises(dataclasses.FrozenInstanceError):
         Decorated(3).count = 4  # type: ignore[misc]
